@@ -124,7 +124,8 @@ def as_array(name: str, values: ArrayLike, *, ndim: int | tuple[int, ...]) -> ND
 
     A copy is made only where the caller's array is not already so.
     """
-    if _is_masked(values):
+    arrays = values if isinstance(values, list | tuple) else (values,)
+    if any(np.ma.is_masked(array) for array in arrays):
         raise InputError(
             f"'{name}' is a masked array, whose mask would be ignored: give it as 'mask', or set "
             "the masked values to NaN"
@@ -142,12 +143,6 @@ def as_array(name: str, values: ArrayLike, *, ndim: int | tuple[int, ...]) -> ND
             f"'{name}' has shape {array.shape}, expected {wanted} dimensions, not {array.ndim}"
         )
     return np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("="))
-
-
-def _is_masked(values: object) -> bool:
-    """Whether an array, or one of a list of arrays, has masked values as numpy.ma marks them."""
-    arrays = values if isinstance(values, list | tuple) else (values,)
-    return any(np.ma.is_masked(array) for array in arrays)
 
 
 def as_floats(name: str, values: ArrayLike, *, ndim: int | tuple[int, ...]) -> NDArray[Any]:

@@ -94,17 +94,13 @@ def ask(
 def say(*findings: Finding) -> tuple[Finding, ...]:
     """Warn of each finding, at the line outside of the package that called it; return all."""
     level, frame = 1, sys._getframe()
-    while frame.f_back is not None and _is_own(frame.f_globals.get("__name__", "")):
+    while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] == "equipix":
         level, frame = level + 1, frame.f_back
     for each in findings:
         warning = WARNINGS[each.concern](each.message)
         warning.kind = each.kind
         warnings.warn(warning, stacklevel=level)
     return findings
-
-
-def _is_own(module: str) -> bool:
-    return module == "equipix" or module.startswith("equipix.")
 
 
 class Flag(IntFlag):

@@ -124,7 +124,9 @@ class DynamicCorrection(Record, kind="dynamic correction", version=2):
         pixels need the temperature to about a millikelvin for 1/250 000 of the range. It takes one
         product and sum for each pixel and term.
         """
-        volts = self._middle_bias() if bias_v is None else number("bias_v", bias_v)
+        low, high = self.axes.bias_v
+        middle = low if low == high else float(np.sqrt((low**2 + high**2) / 2))
+        volts = middle if bias_v is None else number("bias_v", bias_v)
         celsius = number("substrate_c", substrate_c)
         _check_inside("substrate_c", celsius, self.axes.substrate_c, "°C", extrapolate)
         _check_inside("bias_v", volts, self.axes.bias_v, "V", extrapolate)
@@ -144,10 +146,6 @@ class DynamicCorrection(Record, kind="dynamic correction", version=2):
         flags = self.flags.copy()
         set_bits(flags, "non_responding", response < DEAD_RESPONSE)
         return Polynomial(planes, flags, metadata, leaves_offset=True, findings=self.findings)
-
-    def _middle_bias(self) -> float:
-        low, high = self.axes.bias_v
-        return low if low == high else float(np.sqrt((low**2 + high**2) / 2))
 
 
 def _check_inside(

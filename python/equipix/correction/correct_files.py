@@ -151,7 +151,9 @@ def correct_files(
         for _, frames in stream_frames(inputs):
             if done == 0:
                 _warn_of_dark(frames[0], correction, of_dark)
-            for frame in corrector.apply(_taken(frames)):
+            native = frames.dtype.newbyteorder("=")
+            taken = frames.astype(native if native in FAST else np.float32, copy=False)
+            for frame in corrector.apply(taken):
                 yield picture(frame, display) if display else frame
             done += len(frames)
             if progress is not None:
@@ -193,12 +195,6 @@ def _dtype(
             f"{bit_depth}: leave out one"
         )
     return np.dtype(np.uint8)
-
-
-def _taken(frames: NDArray[Any]) -> NDArray[Any]:
-    """Frames in a type that is corrected; in single precision like the corrected values."""
-    native = frames.dtype.newbyteorder("=")
-    return frames.astype(native if native in FAST else np.float32, copy=False)
 
 
 def _write(path: Path, frames: Iterator[NDArray[Any]], *, nbytes: int, mark: str) -> None:

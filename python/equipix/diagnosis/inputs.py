@@ -20,11 +20,6 @@ _DEGENERATE = 0.1
 """Share of the variance of a drift below which the error of its size is over three times larger."""
 
 
-def _on_clipping(exposures: Exposures) -> str | None:
-    """Say that a saturation level is missing or too high."""
-    return None if exposures.clipped is None else clipping_advice(exposures.clipped)
-
-
 def _on_raw(exposures: Exposures) -> str | None:
     """Say that averages, or arrays as cameras write them, are without a dark."""
     if not exposures.raw:
@@ -53,11 +48,6 @@ def _on_units(exposures: Exposures) -> str | None:
         f"{abs(shifts - shifts[0]).max():g}. Expected are pixels: divide micrometres by the pixel "
         "pitch, see 'From micrometres to pixels' in docs/shifts.md"
     )
-
-
-def _on_filters(exposures: Exposures) -> str | None:
-    """Say that colour filters, or those of the read-out, are not the ones named."""
-    return None if exposures.filters is None else exposures.filters.words
 
 
 def _on_repeats(exposures: Exposures) -> str | None:
@@ -206,13 +196,13 @@ def repeated(values: Array, positions: Positions) -> tuple[int, int] | None:
 
 
 BEFORE: tuple[Rule[Exposures], ...] = (
-    Rule("saturation", "input", _on_clipping),
+    Rule("saturation", "input", lambda e: clipping_advice(e.clipped) if e.clipped else None),
     Rule("raw", "input", _on_raw),
-    Rule("light", "misfit", lambda exposures: exposures.unsteady),
+    Rule("light", "misfit", lambda e: e.unsteady),
     Rule("unit", "identifiability", _on_units),
     Rule("flux", "misfit", on_brightness),
     Rule("repeated", "misfit", _on_repeats),
-    Rule("cfa", "misfit", _on_filters),
+    Rule("cfa", "misfit", lambda e: e.filters.words if e.filters else None),
     Rule("rounding", "input", _on_rounding),
     Rule("order", "identifiability", _on_order, severity="note"),
 )

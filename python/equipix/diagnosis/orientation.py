@@ -162,7 +162,8 @@ def orientation_test(
     windows = {way: each.window(side).chosen(asked) for way, each in turned.items()}
     with if_there_is_light():
         fits = _fits(windows, options)
-        left = _left(fits)
+        best = fits[_best(fits)]
+        left = {way for way, fit in fits.items() if fit is best or not fit.is_far_above(best)}
         test = _outcome(fits, left)
         if test.sign != "undetermined" or AS_GIVEN not in left:
             return test
@@ -259,12 +260,6 @@ def _undecided(fits: Mapping[Orientation, WindowFit]) -> list[Orientation]:
     return [best, *others] if others else []
 
 
-def _left(fits: Mapping[Orientation, WindowFit]) -> set[Orientation]:
-    """Orientations that final fits do not exclude."""
-    best = _best(fits)
-    return {way for way, fit in fits.items() if way == best or not fit.is_far_above(fits[best])}
-
-
 def _outcome(fits: Mapping[Orientation, WindowFit], left: set[Orientation]) -> OrientationTest:
     """The findings on the axes from final fits."""
     best = _best(fits)
@@ -347,8 +342,9 @@ def with_hidden(
     """
     fluxes = {way: _fluxes(fit, windows[way], flux) for way, fit in fits.items()}
     others = [way for way in fits if way != AS_GIVEN]
-    likely = [way for way in others if _is_likely(fluxes[way], fluxes[AS_GIVEN])]
-    if likely:
+    given = fluxes[AS_GIVEN]
+    likely = [way for way in others if fluxes[way].distance < _SMALLER * given.distance]
+    if likely and not given.agree:
         best = min(likely, key=lambda way: fluxes[way].distance)
         size, _ = _difference(fits[best], fits[AS_GIVEN], shape)
         return dataclasses.replace(test, hidden=best, difference=size, is_likely=True)
@@ -363,11 +359,6 @@ def with_hidden(
         return test
     best = max(found, key=lambda way: found[way])
     return dataclasses.replace(test, hidden=best, difference=found[best])
-
-
-def _is_likely(other: _Fluxes, given: _Fluxes) -> bool:
-    """Whether other fluxes agree with those given, and those of the shifts as given do not."""
-    return not given.agree and other.distance < _SMALLER * given.distance
 
 
 def _fluxes(fit: WindowFit, window: Exposures, flux: Flux) -> _Fluxes:

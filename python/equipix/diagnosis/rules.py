@@ -162,10 +162,6 @@ def _on_convergence(e: Evidence) -> str | None:
     )
 
 
-def _on_uncertainty(e: Evidence) -> str | None:
-    return why_none(e.weighted) if e.options.uncertainty else None
-
-
 def _on_dark(e: Evidence) -> str | None:
     if e.dark is None:
         return None
@@ -222,7 +218,11 @@ AFTER: tuple[Rule[Evidence], ...] = (
     Rule("prior", "misfit", _replaced("flux_std"), unless=_SOURCES),
     Rule("prior", "misfit", _replaced("shift_std"), unless=_SOURCES),
     Rule("convergence", "convergence", _on_convergence),
-    Rule("uncertainty", "convergence", _on_uncertainty),
+    Rule(
+        "uncertainty",
+        "convergence",
+        lambda e: why_none(e.weighted) if e.options.uncertainty else None,
+    ),
     Rule("variance", "misfit", _replaced("variance"), severity="note"),
     Rule("misfit", "misfit", small_errors_found, unless=_STRONGER, instead=frozenset({"misfit"})),
 )

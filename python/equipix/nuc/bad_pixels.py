@@ -84,17 +84,17 @@ def of_frames(
     """Bad pixels by their noise, and what limits it; `good` are those whose curves are usable."""
     slow, light = None, Light()
     said: tuple[Finding, ...] = ()
+    given = frames.mean if isinstance(frames, FrameStatistics) else stack_of("frames", frames)
+    if given.shape[-2:] != good.shape:
+        raise InputError(f"'frames' has frames of {given.shape[-2:]}, the sensor {good.shape}")
     if isinstance(frames, FrameStatistics):
-        _check_shape(frames.mean.shape, good.shape)
         mean, variance, count = frames.mean, frames.variance, int(frames.count.max())
         step, light = frames.step, light_of(frames)
     else:
-        stack = stack_of("frames", frames)
-        _check_shape(stack.shape[1:], good.shape)
-        over_time = temporal_of(stack, ~good)
+        over_time = temporal_of(given, ~good)
         said = say(*ask(STEADY, over_time))
         mean, variance, count = over_time.mean, over_time.variance, over_time.frames
-        step = noise.step_of(stack.reshape(len(stack), -1)[:, :: -(-stack[0].size // _SAMPLED)])
+        step = noise.step_of(given.reshape(len(given), -1)[:, :: -(-given[0].size // _SAMPLED)])
         slow = defects.flickering_pixels(over_time.steps, variance, count, limits.correlation)
     if count < 2:
         raise InputError("'frames' holds one frame, expected two or more: one shows no noise")
@@ -160,11 +160,6 @@ def _common_noise(
     if step == 0 and not points[:, 1].any():
         return None
     return noise.NoiseModel.fit(points, step=step)
-
-
-def _check_shape(found: tuple[int, ...], shape: tuple[int, ...]) -> None:
-    if found != shape:
-        raise InputError(f"'frames' has frames of {found}, the sensor {shape}")
 
 
 PERCENTILES = (0.1, 1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0, 99.9)

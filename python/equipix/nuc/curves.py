@@ -27,7 +27,8 @@ def response_at(deviation: Array, mean: Array | float) -> Floats:
 
 def slope_at(deviation: Array, mean: Array | float) -> Floats:
     """Slope dV/dV̄ of each pixel at the array's mean V̄; the arguments are those of `response_at`."""
-    return np.asarray(1 + polynomial(_derived(deviation), mean))
+    powers = np.arange(1, len(deviation))
+    return np.asarray(1 + polynomial(deviation[1:] * powers[:, None, None], mean))
 
 
 def least_slope(deviation: Array, limits: Array) -> Floats:
@@ -74,12 +75,6 @@ def counted_from(coefficients: Array, dark: Array) -> Floats:
         for lower in range(power + 1):
             moved[lower] += comb(power, lower) * coefficient * (-dark) ** (power - lower)
     return moved
-
-
-def _derived(coefficients: Array) -> Array:
-    """Coefficients of the derivative."""
-    powers = np.arange(1, len(coefficients))
-    return np.asarray(coefficients[1:] * powers[:, None, None])
 
 
 _NODES = 4

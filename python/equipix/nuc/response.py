@@ -202,8 +202,11 @@ class Response(CorrectionBase, Record, kind="response", version=2):
         offset = with_dark(self, dark).dark
         zero = np.zeros(self.shape) if offset is None else offset
 
+        # Curves that have an inverse.
+        rising = np.where(np.isnan(self.inverse[0]), np.nan, self.deviation)
+
         def formula(frame: Array) -> Array:
-            return exact_inverse(self._rising, frame - zero, self.limits)
+            return exact_inverse(rising, frame - zero, self.limits)
 
         return apply(self, frames, dark, flagged, out, formula)
 
@@ -277,11 +280,6 @@ class Response(CorrectionBase, Record, kind="response", version=2):
         if colours not in (None, self.cfa):
             metadata = {**metadata, "sensor": {**metadata.get("sensor", {}), "cfa": colours.rows}}
         return replace(self, flags=self.flags | more.astype(np.uint32), metadata=metadata)
-
-    @property
-    def _rising(self) -> Floats:
-        """Coefficients of the curves that have an inverse, NaN elsewhere."""
-        return np.where(np.isnan(self.inverse[0]), np.nan, self.deviation)
 
 
 def common_misfit(response: Response) -> float:

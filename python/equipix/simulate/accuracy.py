@@ -76,7 +76,11 @@ def noise_prediction(
     truth = as_array("sensitivity", sensitivity, ndim=2).astype(np.float64)
     cells = whole_moves(as_shifts(shifts))
     signal = exposures(truth, beam, cells)
-    noise = _like_signal("variance", variance, signal.shape)
+    if np.shape(variance) not in ((), truth.shape, signal.shape):
+        raise InputError(
+            f"'variance' has shape {np.shape(variance)}, expected {signal.shape} or {truth.shape}"
+        )
+    noise = as_array("variance", variance, ndim=(0, 2, 3)).astype(np.float64)
     if not (np.all(noise > 0) and np.all(signal > 0)):
         raise InputError("'variance' and the signal must be above 0 in every pixel")
     used = ~as_array("mask", np.zeros(truth.shape, bool) if mask is None else mask, ndim=2)
@@ -91,12 +95,6 @@ def noise_prediction(
         results.append(rms_at_both_scales(np.where(used, error, np.nan)))
     rms, block_rms = np.mean(results, axis=0)
     return float(rms), float(block_rms)
-
-
-def _like_signal(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
-    if np.shape(values) not in ((), shape[1:], shape):
-        raise InputError(f"'{name}' has shape {np.shape(values)}, expected {shape} or {shape[1:]}")
-    return as_array(name, values, ndim=(0, 2, 3)).astype(np.float64)
 
 
 class ReducedSystem:

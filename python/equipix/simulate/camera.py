@@ -221,7 +221,8 @@ class Camera(Digitised):
                 f"'light_e' goes down to {np.min(electrons):.3g} electrons, expected 0 or more "
                 "everywhere: is the beam below 0, as one of a large contrast?"
             )
-        normal = self._is_normal(electrons)
+        room = self.full_well_e - electrons
+        normal = (electrons >= MANY_E) & (room > WELL_MARGIN * np.sqrt(electrons))
         mean = np.where(normal, electrons, 0.0)
         level = np.float32(self.gain_dn_per_e * mean + self.offset)
         noise = np.float32(self.gain_dn_per_e * np.sqrt(mean + self.read_noise_e**2))
@@ -236,8 +237,3 @@ class Camera(Digitised):
             return frame
 
         return self._frames(drawn, count, rng)
-
-    def _is_normal(self, electrons: Floats) -> NDArray[np.bool_]:
-        """Whether the number of photons is nearly normally distributed, far below the full well."""
-        room = self.full_well_e - electrons
-        return (electrons >= MANY_E) & (room > WELL_MARGIN * np.sqrt(electrons))

@@ -301,7 +301,9 @@ def experiment(
         dead=bad[:dead],
         hot=bad[dead:],
     )
-    positions = _reached(as_shifts(shifts), stage_error, rng)
+    positions = as_shifts(shifts)
+    # Each move of the stage has a random error.
+    positions[1:] += rng.normal(0, stage_error, positions[1:].shape).cumsum(axis=0)
 
     def light(rows: Floats, cols: Floats) -> Floats:
         return exposure_e * beam(rows, cols)
@@ -317,13 +319,6 @@ def experiment(
         entropy=int(rng.integers(2**63)),
         cfa=colours,
     )
-
-
-def _reached(shifts: Floats, stage_error: float, rng: np.random.Generator) -> Floats:
-    """Positions that the stage reaches: each move has a random error."""
-    errors = np.zeros_like(shifts)
-    errors[1:] = rng.normal(0, stage_error, errors[1:].shape).cumsum(axis=0)
-    return shifts + errors
 
 
 def _behind_hole(beam: Beam, shape: tuple[int, int], positions: Floats) -> Beam:
