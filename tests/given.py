@@ -1,13 +1,22 @@
-"""Exposures of arrays, as `equipix.calibrate` makes them before its fit."""
+"""What tests of several rooms share: exposures of arrays, small experiments between pixels."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
+import equipix
+from equipix import simulate
 from equipix.exposures.exposures import Exposures
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Positions
 from equipix.measured.measured import measured_of
+
+SMALL = (9, 12)
+SMALL_CROSS = np.array([(0, 0), (0, 2), (0, 3), (2, 0), (3, 0)], float)
+TURNED = [0, 90, 180, 270, 0]
+CROSS = equipix.cross_pattern(11, 19).astype(float)
 
 
 def exposures_of(
@@ -30,3 +39,29 @@ def exposures_of(
     return Exposures.of(
         measured, positions, Flux.of(flux, flux_std, time, len(measured)), **options
     )
+
+
+def between(cross, rng):
+    """The cross with random fractions of a pixel, but for its first exposure."""
+    shifts = np.array(cross, float)
+    shifts[1:] += rng.uniform(-0.5, 0.5, (len(shifts) - 1, 2))
+    return shifts
+
+
+def small(seed, shifts, **options):
+    """A tiny sensor with uneven weights and missing measurements."""
+    rng = np.random.default_rng(seed)
+    sensitivity = simulate.paper_sensitivity(SMALL, rng=rng)
+    beam = simulate.wavy_beam(SMALL, width=30, contrast=0.2, rng=rng)
+    frames = simulate.exposures(sensitivity, beam, shifts, **options)
+    variance = rng.uniform(1e-6, 2e-6, frames.shape)
+    frames += np.sqrt(variance) * rng.standard_normal(frames.shape)
+    return frames, {"variance": variance, "mask": rng.random(frames.shape) < 0.05}
+
+
+def used(cal, measured):
+    """The same with those measurements masked that the fit lost."""
+    mask = measured["mask"].copy()
+    for k, lost in enumerate(cal.weighted.fit.lost):
+        mask[k].flat[lost] = True
+    return measured | {"mask": mask}

@@ -176,7 +176,7 @@ class TestSource:
         assert f"{spread(band, **how):.1e}" == wanted
 
     def test_the_example_prints_them_beside_those_of_the_source(self, capsys):
-        path = Path(__file__).parents[1] / "examples/composition.py"
+        path = Path(__file__).parents[2] / "examples/composition.py"
         runpy.run_path(str(path), run_name="__main__")
         printed = capsys.readouterr().out
         assert "0.0006  1.11" in printed

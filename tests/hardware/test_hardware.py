@@ -7,11 +7,11 @@ import re
 import shutil
 import subprocess
 
-import hardware as docs
 import numpy as np
 import pytest
 
 import equipix
+import hardware as docs
 import reference
 from equipix import Flag, Polynomial, errors, hardware, nuc
 from equipix.io.tiff import write_frames

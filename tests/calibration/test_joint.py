@@ -21,40 +21,11 @@ from equipix.errors import (
     InputError,
     MisfitWarning,
 )
+from given import CROSS, SMALL, SMALL_CROSS, TURNED, between, small, used
 
-SMALL = (9, 12)
-SMALL_CROSS = np.array([(0, 0), (0, 2), (0, 3), (2, 0), (3, 0)], float)
-TURNED = [0, 90, 180, 270, 0]
 SENSOR = (120, 160)
-CROSS = equipix.cross_pattern(11, 19).astype(float)
 NOISE = 1e-3 / np.sqrt(3)
 """Standard deviation of noise that is uniform within 1e-3."""
-
-
-def between(cross, rng):
-    """The cross with random fractions of a pixel, but for its first exposure."""
-    shifts = np.array(cross, float)
-    shifts[1:] += rng.uniform(-0.5, 0.5, (len(shifts) - 1, 2))
-    return shifts
-
-
-def small(seed, shifts, **options):
-    """A tiny sensor with uneven weights and missing measurements."""
-    rng = np.random.default_rng(seed)
-    sensitivity = simulate.paper_sensitivity(SMALL, rng=rng)
-    beam = simulate.wavy_beam(SMALL, width=30, contrast=0.2, rng=rng)
-    frames = simulate.exposures(sensitivity, beam, shifts, **options)
-    variance = rng.uniform(1e-6, 2e-6, frames.shape)
-    frames += np.sqrt(variance) * rng.standard_normal(frames.shape)
-    return frames, {"variance": variance, "mask": rng.random(frames.shape) < 0.05}
-
-
-def used(cal, measured):
-    """The same with those measurements masked that the fit lost."""
-    mask = measured["mask"].copy()
-    for k, lost in enumerate(cal.weighted.fit.lost):
-        mask[k].flat[lost] = True
-    return measured | {"mask": mask}
 
 
 def structured(seed, *, whole=False, noise=1e-3, shape=SENSOR):

@@ -403,7 +403,7 @@ class TestOthers:
 
 
 def test_the_examples_of_the_page_run():
-    page = Path(__file__).parents[1] / "docs/colour.md"
+    page = Path(__file__).parents[2] / "docs/colour.md"
     found = doctest.testfile(str(page), module_relative=False)
     assert found.attempted > 10
     assert found.failed == 0

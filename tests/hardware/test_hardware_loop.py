@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import hardware as docs
 import numpy as np
 import pytest
 
+import hardware as docs
 import reference
 from equipix import errors, hardware
 

@@ -6,12 +6,6 @@ import warnings
 
 import numpy as np
 import pytest
-
-import equipix
-import reference
-from equipix import simulate
-from equipix.errors import IdentifiabilityWarning
-from test_joint import CROSS, SMALL, SMALL_CROSS, TURNED, between, small, used
 from test_uncertainty import (
     DRAWS_EXACT_TO,
     MOST_DRAWS,
@@ -19,6 +13,12 @@ from test_uncertainty import (
     lowest_modes,
     mean_square_scores,
 )
+
+import equipix
+import reference
+from equipix import simulate
+from equipix.errors import IdentifiabilityWarning
+from given import CROSS, SMALL, SMALL_CROSS, TURNED, between, small, used
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::equipix.errors.IdentifiabilityWarning"),

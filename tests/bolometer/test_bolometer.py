@@ -237,7 +237,7 @@ class TestCorrectionAtAState:
         np.testing.assert_array_equal(again.coefficients, now.coefficients)
 
     def test_the_example_leaves_less_than_the_noise(self, capsys):
-        path = Path(__file__).parents[1] / "examples/bolometer.py"
+        path = Path(__file__).parents[2] / "examples/bolometer.py"
         runpy.run_path(str(path), run_name="__main__")
         *_, frame, noise = capsys.readouterr().out.splitlines()
         before, after = map(float, re.findall(r"(\d+\.\d+) DN", frame))
