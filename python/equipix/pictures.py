@@ -24,6 +24,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+def missing_matplotlib() -> EquipixError:
+    """Return the error that names the library which is missing, and how to get it."""
+    return EquipixError(
+        "pictures need matplotlib, which is not installed: pip install 'equipix[plot]'"
+    )
+
+
 def new_figure(width: float, height: float) -> Figure:
     """Make an empty figure of this size in inches, drawn without a display.
 
@@ -35,9 +42,7 @@ def new_figure(width: float, height: float) -> Figure:
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise EquipixError(
-            "pictures need matplotlib, which is not installed: pip install 'equipix[plot]'"
-        ) from error
+        raise missing_matplotlib() from error
     return Figure(figsize=(width, height), layout="constrained")
 
 

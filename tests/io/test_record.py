@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 import pytest
 import tifffile
+from PIL import Image
 
 import equipix
 from equipix import bolometer, hardware, nuc, simulate
@@ -26,7 +27,7 @@ from equipix.scene.scene_correction import SceneState
 from records import rewrite
 
 SHAPE = (24, 32)
-SUFFIXES = (".tif", ".npz")
+SUFFIXES = (".tif", ".npz", ".fits")
 
 
 def measured(level, count=6, seed=0):
@@ -124,8 +125,13 @@ def test_other_software_reads_the_pages(tmp_path, name):
         assert sum(len(each.pages) for each in file.series) == len(file.pages)
     with pytest.raises(FileError, match=f"holds .*{KINDS[name].KIND}, expected raw frames"):
         refuse_saved(tmp_path / "a.tif")
-    image = first.reshape(-1, *first.shape[-2:])[0]
-    np.testing.assert_array_equal(tifffile.imread(tmp_path / "a.tif", key=0), image)
+    # The first page is what they show.
+    image = tifffile.imread(tmp_path / "a.tif", key=0)
+    assert image.dtype == np.float32
+    assert np.isfinite(image).all()
+    np.testing.assert_array_equal(image, KINDS[name].viewed().image.astype(np.float32))
+    with Image.open(tmp_path / "a.tif") as opened:
+        np.testing.assert_array_equal(np.asarray(opened), image)
 
 
 def test_all_records_are_tested():

@@ -11,6 +11,7 @@ from equipix.correction.polynomial import Polynomial
 from equipix.errors import InputError
 from equipix.findings import Finding, set_bits
 from equipix.io.record import Counts, Record
+from equipix.io.viewed import Viewed
 from equipix.measured.defects import DEAD_RESPONSE
 
 _ROUNDING = 1e-9
@@ -91,6 +92,11 @@ class DynamicCorrection(Record, kind="dynamic correction", version=2):
         """Sizes of the sensor (rows, cols)."""
         rows, cols = self.flags.shape
         return rows, cols
+
+    def viewed(self) -> Viewed:
+        """Return the gain in the middle of the calibrated range, as other programs show it."""
+        low, high = self.axes.substrate_c
+        return self.correction((low + high) / 2).viewed()
 
     def correction(
         self, substrate_c: float, bias_v: float | None = None, *, extrapolate: bool = False

@@ -31,6 +31,7 @@ from equipix.findings import Finding, determined
 from equipix.fitting.error_bars import functional_std
 from equipix.fitting.weighted import Weighted, check_unchanged
 from equipix.io.record import UNSAVED, Counts, Map, Record
+from equipix.io.viewed import Viewed
 from equipix.measured.colour import Colours
 from equipix.measured.measured import measured_of
 from equipix.measured.noise import NoiseModel
@@ -279,6 +280,10 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
             f"<Calibration of {self.shape[0]} x {self.shape[1]} pixels from {len(self.shifts)} "
             f"exposures: {state}, error estimate {self.error_estimate:.1e}{noise}>"
         )
+
+    def viewed(self) -> Viewed:
+        """Return the sensitivity with its standard deviation, as other programs show them."""
+        return Viewed.of(self.sensitivity, self.flags, self.sensitivity_std)
 
     @property
     def tilt(self) -> NDArray[Any]:

@@ -22,8 +22,9 @@ CALLED: ContextVar[Any] = ContextVar("CALLED", default=None)
 
 COMMANDS = {
     "calibrate": ("calibrate", "Calibrate a sensor from the images of an experiment."),
-    "inspect": ("calibrate", "Show what a file of a correction, or of averaged frames, holds."),
+    "inspect": ("calibrate", "Show what a result holds, and a picture of its maps."),
     "compare": ("calibrate", "Show how far calibrations of one sensor agree."),
+    "report": ("report", "Write results as one page, judged by limits."),
     "average": ("frames", "Mean and variance of every pixel over many frames."),
     "correct": ("frames", "Correct frames by a calibration or by response curves."),
     "nuc": ("nuc", "Uniform source: fit response curves, find bad pixels, measure quality."),

@@ -10,7 +10,6 @@ import typer
 
 from equipix.calibration.result import Calibration
 from equipix.cli import terminal
-from equipix.cli.summary import show_saved, summary
 from equipix.comparison import compare as compare_calibrations
 from equipix.errors import EquipixError, InputError
 from equipix.experiment.experiment import Experiment
@@ -18,6 +17,8 @@ from equipix.io.formats import SUFFIXES
 from equipix.io.paths import refuse_inputs
 from equipix.io.record import read_record
 from equipix.pictures import check_picture, draw_comparison, save_figure
+from equipix.report.drawing import draw_result
+from equipix.report.figures import summary
 from equipix.saved_results import load
 
 commands = typer.Typer()
@@ -59,7 +60,7 @@ def calibrate(
         calibration = loaded.run(mask=excluded, workers=workers, progress=progress, **options)
     if not partial:
         _refuse_partial(calibration, output)
-    show_saved(output, calibration, calibration.findings, force=force, as_json=as_json)
+    terminal.show_saved(output, calibration, calibration.findings, force=force, as_json=as_json)
 
 
 def _refuse_partial(calibration: Calibration, output: Path) -> None:
@@ -71,14 +72,21 @@ def _refuse_partial(calibration: Calibration, output: Path) -> None:
             )
 
 
-@commands.command(epilog="Example: equipix inspect cal.tif")
+@commands.command(epilog="Example: equipix inspect cal.tif -o cal.png")
 def inspect(
-    file: Annotated[Path, typer.Argument(help="A correction or an average: .tif or .npz.")],
+    file: Annotated[Path, typer.Argument(help="A result that equipix has saved.")],
+    output: terminal.Picture = None,
+    force: terminal.Force = False,
     as_json: terminal.Json = False,
 ) -> None:
-    """Show what a file of a correction, or of averaged frames, holds."""
+    """Show what a result holds: its main figures, and a picture of its maps."""
+    check_picture(output)
+    terminal.check_output(output, [file], force=force)
     content = load(file)
     result = {"file": str(file), **summary(content)}
+    if output is not None:
+        save_figure(draw_result(content), output, force=force)
+        result["picture"] = str(output)
     if as_json and hasattr(content, "metadata"):
         result["metadata"] = content.metadata
     terminal.show_result(result, as_json=as_json)

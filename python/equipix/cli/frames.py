@@ -6,7 +6,6 @@ from typing import Annotated, Any
 import typer
 
 from equipix.cli import terminal
-from equipix.cli.summary import known, show_saved
 from equipix.correction.correct_files import correct_files, is_folder
 from equipix.errors import InputError
 from equipix.experiment.image_files import origin_of, refuse_repeated_files
@@ -15,6 +14,7 @@ from equipix.io.formats import SUFFIXES
 from equipix.io.paths import find_files, refuse_inputs
 from equipix.measured import statistics
 from equipix.measured.average import average as average_frames
+from equipix.report.figures import known
 from equipix.saved_results import load_correction
 
 commands = typer.Typer()
@@ -56,7 +56,7 @@ def average(
             statistics.refuse_subtracted(offset, " ".join(dark))
         found = average_frames(frames, dark=offset, mask=excluded, **common, **options)
     said = say(*ask(statistics.AVERAGED, found))
-    show_saved(output, found, said, force=force, as_json=as_json)
+    terminal.show_saved(output, found, said, force=force, as_json=as_json)
 
 
 @commands.command(epilog="Example: equipix correct cal.tif raw/*.tif -o corrected/")

@@ -10,8 +10,6 @@ import typer
 from equipix import metrics
 from equipix._check import Array, By, Flagged, Order, naming_memory
 from equipix.cli import terminal
-from equipix.cli.summary import flagged as flag_counts
-from equipix.cli.summary import show_saved, told
 from equipix.correction.protocol import Correction, check_sensor, named_cfa
 from equipix.experiment.level_experiment import LevelExperiment
 from equipix.io.formats import SUFFIXES
@@ -21,6 +19,8 @@ from equipix.measured.colour import Colours
 from equipix.measured.defects import DefectLimits
 from equipix.nuc.bad_pixels import find_defects
 from equipix.nuc.response import Response
+from equipix.report.figures import flagged as flag_counts
+from equipix.report.figures import told
 from equipix.saved_results import load_correction
 
 commands = typer.Typer()
@@ -57,7 +57,7 @@ def fit(
         response = loaded.run(
             order=_ORDERS[order], by=by, mask=excluded, workers=workers, progress=progress
         )
-    show_saved(output, response, response.findings, force=force, as_json=as_json)
+    terminal.show_saved(output, response, response.findings, force=force, as_json=as_json)
 
 
 @nuc.command(epilog="Example: equipix nuc defects response.tif level/*.tif -o flagged.tif")

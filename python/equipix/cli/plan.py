@@ -5,7 +5,6 @@ from typing import Annotated, Any
 import typer
 
 from equipix.cli import terminal
-from equipix.cli.summary import told
 from equipix.errors import InputError
 from equipix.exposures.positions import whole_moves
 from equipix.findings import Finding, say
@@ -14,6 +13,7 @@ from equipix.plan.budget import ErrorBudget, error_budget
 from equipix.plan.components import identify
 from equipix.plan.drift import advise_order, distinct_trend
 from equipix.plan.search import suggest
+from equipix.report.figures import told
 
 commands = typer.Typer()
 

@@ -7,12 +7,12 @@ from typing import Annotated, Any, Literal
 import typer
 
 from equipix.cli import terminal
-from equipix.cli.summary import of_scene, told
 from equipix.errors import FileError, InputError
 from equipix.io.formats import SUFFIXES, raw_header
 from equipix.io.paths import find_files, refuse_inputs
 from equipix.io.record import read_record
 from equipix.pictures import check_picture, draw_sequence, save_figure
+from equipix.report.figures import of_scene, told
 from equipix.scene.methods import METHODS, resumed
 from equipix.scene.scene_correction import SceneCorrection, SceneState
 from equipix.scene.sequence import SequenceResult, check_range, run_sequence

@@ -17,9 +17,12 @@ from equipix._check import Array, Bools, Progress
 from equipix.correction.correct_files import warn_of_corrected
 from equipix.errors import FileError, InputError
 from equipix.experiment import image_files
+from equipix.findings import Finding
 from equipix.io.formats import raw_header
 from equipix.io.frames import read_frames, read_mask
 from equipix.io.paths import find_files, refuse_inputs
+from equipix.io.record import Record
+from equipix.report.figures import summary, told
 
 _WHOLE = 1e9
 """Whole numbers below this are printed with all digits, as saturation levels are."""
@@ -71,6 +74,15 @@ def show_result(result: dict[str, Any], *, as_json: bool) -> None:
     for name, value in result.items():
         words = _words(value).replace("\n", "\n" + " " * (width + 2))
         print(f"{name.replace('_', ' '):<{width}}  {words}")  # noqa: T201
+
+
+def show_saved(
+    output: Path, result: Record, findings: Iterable[Finding], *, force: bool, as_json: bool
+) -> None:
+    """Save a result, and print its main figures and its findings."""
+    result.save(output, force=force)
+    figures = {"output": str(output), **summary(result), **told(findings, as_json=as_json)}
+    show_result(figures, as_json=as_json)
 
 
 def show_table(titles: Iterable[str], rows: Iterable[Iterable[str]]) -> None:

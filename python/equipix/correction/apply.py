@@ -31,7 +31,9 @@ from equipix.correction.protocol import (
 )
 from equipix.errors import InputError
 from equipix.findings import usable
+from equipix.io.viewed import Viewed
 from equipix.measured.colour import Colours
+from equipix.shown import Shown
 
 FAST = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
 """Types of frames, and of corrected frames, that are corrected in single precision."""
@@ -99,7 +101,7 @@ class Prepared:
             target[...] = made
 
 
-class CorrectionBase(ReadOnly):
+class CorrectionBase(Shown, ReadOnly):
     """Base of corrections that are frozen dataclasses: what follows from flags and metadata.
 
     Coefficients are prepared once, for the dark and the treatment of bad pixels of the last call.
@@ -129,6 +131,12 @@ class CorrectionBase(ReadOnly):
     def colours(self: Correction) -> Colours | None:
         """Colour filters of the pixels, where they are known."""
         return Colours.of(sensor_table(self.metadata).get("cfa"))
+
+    def viewed(self: Correction) -> Viewed:
+        """Return the gain, or the offset without one, as other programs show it of a file."""
+        planes = self.coefficients
+        image = planes[min(1, len(planes) - 1)]
+        return Viewed.of(image, self.flags, nothing=float(len(planes) > 1))
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the prepared coefficients, which cannot be pickled."""

@@ -11,6 +11,7 @@ import numpy as np
 from equipix._check import Array
 from equipix.errors import FileError
 from equipix.experiment.manifest import LevelManifest, Manifest, entry_files
+from equipix.io.arrays import split
 from equipix.io.formats import refuse_saved
 from equipix.io.frames import frame_format, read_frames
 from equipix.measured.statistics import saved_shape
@@ -156,8 +157,20 @@ def sha256_of(files: Iterable[Path]) -> dict[Path, str]:
 
 
 def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    """Hash of a file; of an array in one the place counts too, of a folder all files."""
+    file, place = split(path)
+    if not place and file.is_file():
+        return _digest(file).hex()
+    found = hashlib.sha256(place.encode())
+    for part in sorted(file.rglob("*")) if file.is_dir() else [file]:
+        if part.is_file():
+            found.update(str(part.relative_to(file)).encode() + _digest(part))
+    return found.hexdigest()
+
+
+def _digest(file: Path) -> bytes:
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").digest()
 
 
 def origin_of(correction: Path) -> str:

@@ -63,11 +63,13 @@ Span = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=2, max_leng
 _Content = TypeVar("_Content", bound=BaseModel)
 
 
-class _Table(BaseModel):
+class Table(BaseModel):
+    """A table of a TOML file, whose keys are known."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
-class Region(_Table):
+class Region(Table):
     """One ``[[sensor.region]]``: a rectangle or a circle of pixels that must not be used."""
 
     rows: Span | None = None
@@ -116,7 +118,7 @@ class Region(_Table):
         return inside
 
 
-class Sensor(_Table):
+class Sensor(Table):
     """Table ``[sensor]``: levels in DN, and pixels that must not be used."""
 
     name: str = ""
@@ -164,13 +166,13 @@ class Sensor(_Table):
         return "bit_depth" if self.saturation is None and self.bit_depth else "saturation"
 
 
-class Dark(_Table):
+class Dark(Table):
     """Table ``[dark]``: frames without light."""
 
     frames: Files
 
 
-class Exposure(_Table):
+class Exposure(Table):
     """One ``[[exposure]]``: the frames of one sensor position, and that position."""
 
     name: Text
@@ -197,7 +199,7 @@ class Exposure(_Table):
         return self
 
 
-class Level(_Table):
+class Level(Table):
     """One ``[[level]]``: frames of a uniform source, and what the source was set to."""
 
     frames: Files
@@ -212,7 +214,7 @@ class Level(_Table):
         return self
 
 
-class LevelManifest(_Table):
+class LevelManifest(Table):
     """The whole levels.toml."""
 
     format: Literal[1] = 1
@@ -244,7 +246,7 @@ class LevelManifest(_Table):
         return [(name, each.frames) for name, each in zip(self.names, self.level, strict=True)]
 
 
-class Manifest(_Table):
+class Manifest(Table):
     """The whole experiment.toml."""
 
     format: Literal[1] = 1
@@ -347,8 +349,12 @@ def _sentence(detail: ErrorDetails, content: dict[str, Any]) -> str:
         return f"unknown key '{location[-1]}'{place}{hint}"
     if detail["type"] == "missing":
         return f"key '{location[-1]}' is missing{place}"
-    key = next(key for key in reversed(location) if key in _WANTED)
     value = detail["input"]
+    key = next((key for key in reversed(location) if key in _WANTED), None)
+    if key is None:
+        named = next(part for part in reversed(location) if isinstance(part, str))
+        wanted = detail["msg"].replace("Input should be", "expected")
+        return f"'{named}'{place} holds {value!r}, {wanted}"
     if key in ("exposure", "level") and isinstance(value, dict):
         return f"[{key}] is one table: write [[{key}]], with two brackets, for each {key}"
     return f"'{key}'{place} holds {value!r}, expected {_WANTED[key]}"

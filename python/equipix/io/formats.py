@@ -11,9 +11,10 @@ import numpy as np
 
 from equipix._check import Array
 from equipix.errors import FileError, InputError
-from equipix.io import tiff
-from equipix.io.frames import Header, frame_format, header
+from equipix.io import fits, tiff
+from equipix.io.frames import Header, frame_format, header, suffix_of
 from equipix.io.paths import as_path, reading, write_whole
+from equipix.io.viewed import Viewed
 
 _TEXT = "metadata"
 """Name of the array of an NPZ file that is the text."""
@@ -29,7 +30,7 @@ _Content = tuple[dict[str, Array], str]
 """Arrays by name, and the text."""
 
 
-def _write_npz(path: Path, pages: Mapping[str, Array], text: str) -> None:
+def _write_npz(path: Path, pages: Mapping[str, Array], text: str, _: Viewed | None) -> None:
     with path.open("wb") as file:
         np.savez(file, allow_pickle=False, **{_TEXT: np.array(text)}, **pages)
 
@@ -43,6 +44,7 @@ def _read_npz(path: Path) -> _Content:
 _FORMATS = {
     **dict.fromkeys((".tif", ".tiff"), (tiff.write_pages, tiff.read_pages)),
     ".npz": (_write_npz, _read_npz),
+    **dict.fromkeys(fits.SUFFIXES, (fits.write_pages, fits.read_pages)),
 }
 """What writes and reads arrays and a text in each format; of other files there is no text."""
 
@@ -53,20 +55,24 @@ def save_pages(
     path: str | PathLike[str],
     pages: Mapping[str, Array],
     metadata: Mapping[str, Any],
+    viewed: Viewed | None = None,
     *,
     force: bool = False,
 ) -> None:
-    """Write named arrays and metadata to a .tif or .npz file, which appears whole or not at all.
+    """Write named arrays and metadata to a file, which appears whole or not at all.
 
     Parameters
     ----------
     path : path
-        Output; its suffix names the format.
+        Output; its suffix names the format: .tif, .npz or .fits.
     pages : mapping of str to ndarray
         Arrays by name, each kept in its own dtype: of shape (rows, cols), or a stack of shape
         (n, rows, cols), whose images are pages of their own in a TIFF.
     metadata : mapping
         JSON values; in a TIFF they are the first page's description. Their checksum is added.
+    viewed : Viewed, optional
+        What other programs show: the first page of a TIFF, as float32, and the primary image of a
+        FITS file.
     force : bool, optional
         Replace a file that is there.
 
@@ -80,7 +86,7 @@ def save_pages(
     write_pages, _ = _format(as_path("path", path))
     text = json.dumps({**metadata, _CRC: _checksum(metadata)}, separators=_SEPARATORS)
     with write_whole(path, force=force) as temporary:
-        write_pages(temporary, pages, text)
+        write_pages(temporary, pages, text, viewed)
 
 
 def load_pages(path: str | PathLike[str]) -> tuple[dict[str, Array], dict[str, Any]]:
@@ -89,7 +95,7 @@ def load_pages(path: str | PathLike[str]) -> tuple[dict[str, Array], dict[str, A
     Parameters
     ----------
     path : path
-        A .tif or .npz file.
+        A .tif, .npz or .fits file.
 
     Returns
     -------
@@ -125,7 +131,9 @@ def load_pages(path: str | PathLike[str]) -> tuple[dict[str, Array], dict[str, A
 
 def _format(path: Path) -> tuple[Callable[..., None], Callable[[Path], _Content]]:
     if path.suffix.lower() not in _FORMATS:
-        raise InputError(f"{path}: ends in '{path.suffix}', expected the suffix .tif or .npz")
+        raise InputError(
+            f"{path}: ends in '{path.suffix}', expected the suffix .tif, .npz or .fits"
+        )
     return _FORMATS[path.suffix.lower()]
 
 
@@ -147,10 +155,11 @@ def saved_kind(path: Path) -> str | None:
 
     Files of whole numbers, which cameras write, are not searched.
     """
-    if path.suffix.lower() == ".npz":
+    suffix = suffix_of(path)
+    if suffix == ".npz" or suffix in fits.SUFFIXES:
         with reading(path):
-            return _kind(_read_npz(path)[1])
-    is_searched = path.suffix.lower() in SUFFIXES and frame_format(path)[1].kind == "f"
+            return _kind(_read_npz(path)[1] if suffix == ".npz" else fits.description(path))
+    is_searched = suffix_of(path) in SUFFIXES and frame_format(path)[1].kind == "f"
     return _kind(header(path).description) if is_searched else None
 
 
@@ -187,7 +196,7 @@ def raw_headers(files: Iterable[Path], shape: tuple[int, int]) -> dict[Path, Hea
 
 def raw_header(path: Path) -> Header:
     """Shape, dtype and text of raw frames; what `save_pages` wrote is refused like there."""
-    if path.suffix.lower() == ".npz":
+    if suffix_of(path) in (".npz", *fits.SUFFIXES):
         refuse_saved(path)
     found = header(path)
     _refuse_kind(path, _kind(found.description) if found.dtype.kind == "f" else None)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from equipix import _native
 from equipix.errors import FileError, UnsupportedFileError
-from equipix.io import png, tiff
+from equipix.io import arrays, fits, png, tiff
 from equipix.io.paths import as_path, find_files, reading
 
 _AT_ONCE = 2**27
@@ -74,6 +74,23 @@ def stream_frames(
             yield path, frames
 
 
+_READERS = {
+    **dict.fromkeys(arrays.SUFFIXES, arrays),
+    **dict.fromkeys(fits.SUFFIXES, fits),
+}
+"""The module that reads each kind of file besides images: ``header`` and ``stream_frames``."""
+
+
+def is_image(path: Path) -> bool:
+    """Whether a file is an image, which the compiled reader or tifffile decodes."""
+    return suffix_of(path) not in _READERS
+
+
+def suffix_of(path: Path) -> str:
+    """Suffix of a file, without the place of an array in it."""
+    return arrays.split(path)[0].suffix.lower()
+
+
 def frame_format(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any]]:
     """Shape (n, rows, cols) and dtype of the frames of a file, none of which is decoded.
 
@@ -82,6 +99,8 @@ def frame_format(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any]]:
     FileError
         If the file cannot be read or holds no grey image.
     """
+    if not is_image(path):
+        return header(path)[:2]
     try:
         count, rows, cols, bits = _native.file_format(path)
     except UnsupportedFileError:
@@ -99,13 +118,20 @@ class Header(NamedTuple):
 
 def header(path: Path) -> Header:
     """Read what a file says of its frames, a TIFF in one go; the errors are of `frame_format`."""
-    suffix = path.suffix.lower()
+    suffix = suffix_of(path)
+    if not is_image(path):
+        with reading(path):
+            return Header(*_READERS[suffix].header(path))
     if suffix in (".tif", ".tiff"):
         return Header(*tiff.header(path))
     return Header(*frame_format(path), png.description(path) if suffix == ".png" else "")
 
 
 def _frames(path: Path, workers: int | None) -> Iterator[NDArray[Any]]:
+    if not is_image(path):
+        with reading(path):
+            yield from _READERS[suffix_of(path)].stream_frames(path)
+        return
     with suppress(UnsupportedFileError):
         count, rows, cols, bits = _native.file_format(path)
         if count == 1 or count * rows * cols * bits <= 8 * _AT_ONCE:

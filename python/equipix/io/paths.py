@@ -13,6 +13,7 @@ from os import PathLike
 from pathlib import Path
 
 from equipix.errors import EquipixError, FileError, InputError
+from equipix.io.arrays import ZARR, split
 
 
 def find_files(
@@ -49,9 +50,10 @@ def find_files(
 def _matches(name: str | PathLike[str], folder: Path) -> list[Path]:
     pattern = str(as_path("frames", name))
     path = folder / pattern
-    if path.is_dir():
+    file, _ = split(path)
+    if file.is_dir() and file.suffix.lower() not in ZARR:
         raise FileError(f"{path}: is a folder, expected files: name them by a glob, {path}/*.tif")
-    if path.exists():
+    if file.exists():
         return [path]
     if not glob.has_magic(pattern):
         raise FileError(f"{path}: does not exist")

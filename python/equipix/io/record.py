@@ -34,6 +34,8 @@ from equipix._check import Array, Floats, ReadOnly
 from equipix._native import __version__
 from equipix.errors import FileError, InputError
 from equipix.io.formats import load_pages, save_pages
+from equipix.io.viewed import Viewed
+from equipix.shown import Shown
 
 Map = Annotated[Array, "float32|float64", "rows cols"]
 
@@ -55,7 +57,7 @@ _PLAIN: dict[Any, Any] = {bool: bool, int: int, float: (float, int), str: str}
 """Types of the JSON values of an annotation."""
 
 
-class Record(ReadOnly):
+class Record(Shown, ReadOnly):
     """Base of results that are saved: frozen dataclasses with read-only arrays."""
 
     KIND: ClassVar[str]
@@ -71,7 +73,9 @@ class Record(ReadOnly):
         Parameters
         ----------
         path : str or path
-            The file; its suffix, .tif or .npz, names the format. It appears whole or not at all.
+            The file; its suffix, .tif, .npz or .fits, names the format. It appears whole or not at
+            all. Other programs show a copy of the sensitivity, the gain or the mean: the first page
+            of a TIFF, in single precision, and the primary image of a FITS file.
         force : bool
             Whether an existing file may be replaced.
 
@@ -89,7 +93,12 @@ class Record(ReadOnly):
         except _MISFITS as error:
             raise InputError(f"this {self.KIND} cannot be saved: {error}") from error
         content = {"kind": self.KIND, "version": self.VERSION, "equipix": __version__}
-        save_pages(path, held.by_name, content | {"fields": fields}, force=force)
+        metadata = content | {"fields": fields}
+        save_pages(path, held.by_name, metadata, self.viewed(), force=force)
+
+    def viewed(self) -> Viewed | None:
+        """Return what other programs show of a file; None without a map that is meant for them."""
+        return None
 
 
 Kind = TypeVar("Kind", bound=Record)

@@ -14,10 +14,13 @@ from numpy.typing import NDArray
 
 from equipix.errors import FileError
 from equipix.io.paths import reading
+from equipix.io.viewed import Viewed
 
 _PAGE_NAME = 285  # TIFF tag
 
 _PAGE_NUMBER = 297  # TIFF tag: number from 0, and how many there are
+
+_VIEW = "view"  # name of the page for other programs, which no result reads
 
 _SUBFILE_TYPE = 255  # TIFF tag
 
@@ -106,13 +109,19 @@ def write_frames(
             description = None
 
 
-def write_pages(path: Path, pages: Mapping[str, NDArray[Any]], description: str) -> None:
+def write_pages(
+    path: Path, pages: Mapping[str, NDArray[Any]], description: str, viewed: Viewed | None
+) -> None:
     """Write named arrays as pages, with a description of the first.
+
+    The first page is what other programs show of the result, in single precision.
 
     The images of a stack have the stack's name and are numbered; a single image has no number.
     Arrays of other sizes than the first one's are the last pages: tifffile takes all pages for
     equal where a few at the beginning and the last are.
     """
+    if viewed is not None:
+        pages = {_VIEW: viewed.image.astype(np.float32), **pages}
     sizes = [array.shape[-2:] for array in pages.values()]
     ordered = sorted(pages.items(), key=lambda each: each[1].shape[-2:] != sizes[0])
     big = sum(array.nbytes for array in pages.values()) > _TIFF_LIMIT
@@ -141,6 +150,7 @@ def read_pages(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
         images: dict[str, list[Any]] = {}
         for page in every:
             images.setdefault(page.tags[_PAGE_NAME].value, []).append(page)
+        images.pop(_VIEW, None)
         pages = {name: _image_or_stack(path, name, found) for name, found in images.items()}
         return pages, every[0].description
 

@@ -25,6 +25,7 @@ from equipix.errors import InputError
 from equipix.findings import Rule
 from equipix.io.formats import refuse_saved, saved_kind
 from equipix.io.record import Counts, Doubles, Record, read_record
+from equipix.io.viewed import Viewed
 from equipix.measured.noise import scatter_limit, step_of
 
 _MAPS = ("mean", "variance", "variance_of_mean", "count", "saturated")
@@ -35,7 +36,7 @@ DARKER = 0.25
 """Share of the dark by which frames are not darker than it: a dark drifts by less."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class FrameStatistics(Record, kind="frame statistics", version=2):
     """Mean and scatter of repeated frames of one scene, as read-only arrays.
 
@@ -91,6 +92,19 @@ class FrameStatistics(Record, kind="frame statistics", version=2):
         super().__post_init__()
         dark = {} if self.dark is None else {"dark": self.dark.mean}
         check_maps("FrameStatistics", self.maps | dark)
+
+    def __repr__(self) -> str:
+        """Short form: sizes, number of frames, mean."""
+        rows, cols = self.mean.shape
+        return (
+            f"<FrameStatistics of {rows} x {cols} pixels, {self.count.max()} frames, mean "
+            f"{np.nanmean(self.mean):.5g} DN>"
+        )
+
+    def viewed(self) -> Viewed:
+        """Return the mean with its standard deviation, as other programs show them."""
+        flags, std = np.zeros(self.mean.shape, np.uint32), np.sqrt(self.variance_of_mean)
+        return dataclasses.replace(Viewed.of(self.mean, flags, std, nothing=0.0), unit="adu")
 
     @property
     def maps(self) -> dict[str, Array]:

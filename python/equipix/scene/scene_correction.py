@@ -23,6 +23,7 @@ from equipix.errors import InputError
 from equipix.findings import Rule, ask, say, set_bits
 from equipix.io.record import Record
 from equipix.measured.defects import unresponsive
+from equipix.shown import Shown
 
 DataRange = tuple[float, float]
 """Lowest and highest raw value in DN."""
@@ -74,7 +75,7 @@ class _Seen:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SceneCorrection:
+class SceneCorrection(Shown):
     """Base of the corrections from the scene: gain and offset that each frame changes.
 
     Raw values v become y = (v − low) / (high − low) with the ends of `data_range`. The corrected

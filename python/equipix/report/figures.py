@@ -1,8 +1,7 @@
-"""Main figures of what the command line reads and writes."""
+"""Main figures of results, with their names and units."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,6 @@ import numpy as np
 from equipix._check import Array
 from equipix.bolometer.dynamic import DynamicCorrection
 from equipix.calibration.result import Calibration
-from equipix.cli import terminal
 from equipix.correction.protocol import Correction, sensor_of
 from equipix.findings import Finding, Flag, usable
 from equipix.io.record import Record
@@ -27,15 +25,6 @@ def summary(content: Record | Correction | SceneCorrection) -> dict[str, Any]:
     """Collect the main figures of what a file holds."""
     figures: Callable[[Any], dict[str, Any]] = _FIGURES.get(type(content), _of_correction)
     return figures(content)
-
-
-def show_saved(
-    output: Path, result: Record, findings: Iterable[Finding], *, force: bool, as_json: bool
-) -> None:
-    """Save a result, and print its main figures and its findings."""
-    result.save(output, force=force)
-    figures = {"output": str(output), **summary(result), **told(findings, as_json=as_json)}
-    terminal.show_result(figures, as_json=as_json)
 
 
 def known(**figures: Any) -> dict[str, Any]:
@@ -239,3 +228,55 @@ _FIGURES: dict[type, Callable[[Any], dict[str, Any]]] = {
     **dict.fromkeys(METHODS.values(), of_scene),
 }
 """What collects the main figures of each kind of result."""
+
+
+FIGURES = {
+    "mean": ("mean", "DN"),
+    "variance": ("variance of a frame", "DN²"),
+    "saturation": ("saturation", "DN"),
+    "levels": ("levels", "DN"),
+    "spread_of_a": ("spread of the offset a", "DN"),
+    "spread_of_K": ("spread of the gain deviation K", ""),
+    "spread_of_c": ("spread of the curvature c", "1/DN"),
+    "spread_of_e": ("spread of the cubic term e", "1/DN²"),
+    "variance_of_a_value": ("variance of a value", "DN²"),
+    "largest_inverse_error": ("largest error of the inverse", "DN"),
+    "floor_dn": ("floor of the pattern", "DN"),
+    "offset_rms": ("rms of the offset", "of the range"),
+    "substrate_c": ("temperature of the substrate", "°C"),
+    "bias_v": ("bias", "V"),
+    "reduced_chi2": ("reduced χ²", ""),
+    "sensitivity_std": ("standard deviation of M, median", ""),
+    "tilt": ("tilt of M, edge to edge", ""),
+    "tilt_std": ("standard deviation of the tilt", ""),
+}
+"""Names and units of figures; of all others the name is the key, and there is no unit."""
+
+
+def words_of(figures: dict[str, Any]) -> list[tuple[str, str]]:
+    """Names and values of figures in words, findings left out."""
+    return [
+        (FIGURES.get(key, (key.replace("_", " "), ""))[0], _words_of(key, value))
+        for key, value in figures.items()
+        if key != "findings"
+    ]
+
+
+def _words_of(key: str, value: Any) -> str:
+    unit = FIGURES.get(key, ("", ""))[1]
+    return f"{_plain(value)} {unit}".strip()
+
+
+def _plain(value: Any) -> str:
+    match value:
+        case bool():
+            return "yes" if value else "no"
+        case None:
+            return "not known"
+        case float():
+            return f"{value:.4g}"
+        case dict():
+            return ", ".join(f"{name} {_plain(item)}" for name, item in value.items()) or "none"
+        case list() | tuple():
+            return ", ".join(_plain(item) for item in value) or "none"
+    return str(value)

@@ -1,0 +1,145 @@
+"""Frames in files of arrays: NumPy, HDF5 and NeXus, Zarr. Each library is imported where it reads.
+
+An array is (rows, cols) or (..., rows, cols). In HDF5 and Zarr its place stands behind a colon:
+``file.h5:/entry/data``; without one it is the only array of two or more axes, or that which NeXus
+names as the default.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from equipix.errors import EquipixError, FileError
+
+_AT_ONCE = 2**26
+"""Most bytes that are read at once; at least a frame is."""
+
+_NPY = b"\x93NUMPY"
+
+HDF5, ZARR = (".h5", ".hdf5", ".nxs", ".nx5"), (".zarr",)
+
+SUFFIXES = (".npy", *HDF5, *ZARR)
+
+_MOST_LISTED = 8
+
+
+def split(path: Path) -> tuple[Path, str]:
+    """Return the file, and the place of an array in it; empty where none is named."""
+    text = str(path)
+    for suffix in (*HDF5, *ZARR):
+        head, found, place = text.partition(f"{suffix}:")
+        if found:
+            return Path(head + suffix), place
+    return path, ""
+
+
+def header(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any], str]:
+    """Shape (n, rows, cols) and dtype of the frames; no text."""
+    with _opened(path) as array:
+        *above, rows, cols = array.shape
+        return (int(np.prod(above)), rows, cols), np.dtype(array.dtype).newbyteorder("="), ""
+
+
+def stream_frames(path: Path) -> Iterator[NDArray[Any]]:
+    """Frames of a file, some at a time, each part of shape (n, rows, cols)."""
+    with _opened(path) as array:
+        *above, rows, cols = array.shape
+        if not above:
+            yield _native(array[:, :])[None]
+            return
+        count = max(1, _AT_ONCE // (rows * cols * array.dtype.itemsize))
+        for outer in np.ndindex(*above[:-1]):
+            for first in range(0, above[-1], count):
+                yield _native(array[(*outer, slice(first, first + count))])
+
+
+def _native(frames: Any) -> NDArray[Any]:
+    """Values in the byte order of the machine."""
+    return np.asarray(frames, np.dtype(frames.dtype).newbyteorder("="))
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Open the array of a file, of numbers and of two axes or more."""
+    file, place = split(path)
+    opened = _npy if file.suffix == ".npy" else _hdf5 if file.suffix in HDF5 else _zarr
+    with opened(file, place) as array:
+        if array.ndim < 2 or np.dtype(array.dtype).kind not in "uif":
+            raise FileError(
+                f"{path}: is {array.dtype} of shape {array.shape}, expected numbers of shape "
+                "(rows, cols) or (n, rows, cols)"
+            )
+        yield array
+
+
+@contextmanager
+def _npy(file: Path, _: str) -> Iterator[Any]:
+    with file.open("rb") as stream:
+        if stream.read(len(_NPY)) != _NPY:
+            raise FileError(f"{file}: is no .npy file, whatever its name says")
+    yield np.load(file, mmap_mode="r", allow_pickle=False)
+
+
+@contextmanager
+def _hdf5(file: Path, place: str) -> Iterator[Any]:
+    try:
+        import h5py
+    except ImportError as error:
+        raise _missing("HDF5", "h5py", "hdf5") from error
+    with h5py.File(file) as root:
+        arrays: list[str] = []
+
+        def visit(name: str, each: Any) -> None:
+            if isinstance(each, h5py.Dataset) and each.ndim >= 2:
+                arrays.append(f"/{name}")
+
+        root.visititems(visit)
+        chosen = place or _nexus_default(root)
+        yield _chosen(file, root, chosen, arrays, lambda each: isinstance(each, h5py.Dataset))
+
+
+def _nexus_default(root: Any) -> str:
+    """Place of the default plot of NeXus: ``default`` of each group, then ``signal``."""
+    group = root
+    while "default" in group.attrs and group.attrs["default"] in group:
+        group = group[group.attrs["default"]]
+    signal = group.attrs.get("signal")
+    return f"{group.name}/{signal}" if isinstance(signal, str) and signal in group else ""
+
+
+@contextmanager
+def _zarr(file: Path, place: str) -> Iterator[Any]:
+    try:
+        import zarr
+    except ImportError as error:
+        raise _missing("Zarr", "zarr", "zarr") from error
+    root = zarr.open(str(file), mode="r")
+    if isinstance(root, zarr.Array):
+        yield root
+        return
+    arrays = [f"/{name}" for name, each in root.members(None) if getattr(each, "ndim", 0) >= 2]
+    yield _chosen(file, root, place, arrays, lambda each: isinstance(each, zarr.Array))
+
+
+def _chosen(
+    file: Path, root: Any, place: str, arrays: list[str], is_array: Callable[[Any], bool]
+) -> Any:
+    """Array at a place, or the only one."""
+    if not place and len(arrays) == 1:
+        (place,) = arrays
+    if place and place in root and is_array(root[place]):
+        return root[place]
+    listed = ", ".join(arrays[:_MOST_LISTED]) or "no array of two or more axes"
+    more = f" and {len(arrays) - _MOST_LISTED} more" if len(arrays) > _MOST_LISTED else ""
+    wrong = f"has no array '{place}'; it " if place else ""
+    raise FileError(f"{file}: {wrong}holds {listed}{more}: name one, as in {file}:/entry/data")
+
+
+def _missing(what: str, library: str, extra: str) -> EquipixError:
+    return EquipixError(
+        f"{what} files need {library}, which is not installed: pip install 'equipix[{extra}]'"
+    )

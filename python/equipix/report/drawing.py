@@ -1,0 +1,216 @@
+"""The picture of a result: its maps, its flags, and how its values are distributed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from equipix._check import Array, Floats
+from equipix.calibration.result import Calibration
+from equipix.measured.noise import nanmedian
+from equipix.pictures import new_figure
+from equipix.report.maps import Map, flagged, maps_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+CMAPS = {"level": "gray", "deviation": "RdBu_r", "size": "viridis"}
+
+_SHARES = (0.1, 99.9)
+"""Percentiles of a map that its colours span."""
+
+_MOST_BINS = 256
+
+_MOST_MARKS = 20_000
+"""Most flagged pixels of a kind that are marked one by one: more look like an area."""
+
+
+def draw_result(result: Any) -> Figure:
+    """Show what a result holds.
+
+    Parameters
+    ----------
+    result : Calibration, Response, DynamicCorrection, FrameStatistics, SceneCorrection, Correction
+        What `equipix.load` reads.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A map of each value, with the smallest and the largest one; the flagged pixels by kind; the
+        histogram of the first map on a logarithmic scale; of a calibration also its profiles and
+        its shifts.
+
+    Raises
+    ------
+    EquipixError
+        If matplotlib is not installed.
+    """
+    maps, flags = maps_of(result), getattr(result, "flags", None)
+    drawn: list[Callable[[Axes], None]] = [partial(draw_map, shown=each) for each in maps]
+    if flags is not None:
+        drawn.append(partial(draw_flags, flags=flags))
+    drawn += curves_of(result, maps[0])
+    cols = min(3, len(drawn))
+    rows = -(-len(drawn) // cols)
+    figure = new_figure(5.2 * cols, 4.2 * rows)
+    places = figure.subplots(rows, cols, squeeze=False).ravel()
+    for axes, draw in zip(places, drawn, strict=False):
+        draw(axes)
+    for axes in places[len(drawn) :]:
+        axes.set_axis_off()
+    return figure
+
+
+def curves_of(result: Any, first: Map) -> list[Callable[[Axes], None]]:
+    """Functions that draw the curves of a result, whose first map is given."""
+    drawn: list[Callable[[Axes], None]] = [
+        partial(draw, shown=first) for draw in (draw_histogram, draw_profiles, draw_spectrum)
+    ]
+    if isinstance(result, Calibration):
+        of_fit = (draw_convergence, draw_shifts)
+        drawn += [partial(draw, calibration=result) for draw in of_fit]
+    return drawn
+
+
+def limits_of(shown: Map, values: Floats) -> tuple[float, float]:
+    """Ends of the colours: two percentiles of what is shown, even around 0 for deviations."""
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return 0.0, 1.0
+    low, high = (float(end) for end in np.percentile(known, _SHARES))
+    if high <= low:  # most values are one, as of flagged pixels
+        low, high = float(known.min()), float(known.max())
+    if shown.scale == "deviation":
+        high = max(-low, high)
+        low = -high
+    return (low, high) if high > low else (low - 0.5, high + 0.5)
+
+
+def draw_map(axes: Axes, shown: Map) -> None:
+    """Draw a map with its scale, its smallest and its largest value."""
+    values, step = shown.reduced()
+    low, high = limits_of(shown, values)
+    rows, cols = (step * size for size in values.shape)
+    extent = (-0.5, cols - 0.5, rows - 0.5, -0.5)
+    image = axes.imshow(
+        values, vmin=low, vmax=high, cmap=CMAPS[shown.scale], extent=extent, interpolation="none"
+    )
+    means = f"means of {step}×{step} pixels; " if step > 1 else ""
+    smallest, largest = shown.extremes
+    axes.set(title=shown.title, xlabel=f"column\n{means}{smallest:.4g} to {largest:.4g}")
+    axes.set_ylabel("row")
+    axes.figure.colorbar(image, ax=axes, shrink=0.8)
+
+
+def draw_flags(axes: Axes, flags: Array) -> None:
+    """Mark the flagged pixels, a colour for each kind, with their numbers."""
+    rows, cols = flags.shape
+    found = flagged(flags)
+    for number, (flag, (row, col)) in enumerate(found.items()):
+        every = -(-len(row) // _MOST_MARKS)
+        name = (flag.name or "").replace("_", " ").lower()
+        axes.plot(
+            col[::every],
+            row[::every],
+            linestyle="",
+            marker="os^Dv"[number % 5],
+            fillstyle="none",
+            markersize=max(3, 10 - 2 * number),  # a pixel may have several flags
+            color=f"C{number}",
+            label=f"{name}: {len(row)}",
+        )
+    axes.set(
+        title=f"Flagged pixels: {np.count_nonzero(flags)} of {flags.size}",
+        xlabel="column",
+        ylabel="row",
+        xlim=(-0.5, cols - 0.5),
+        ylim=(rows - 0.5, -0.5),
+        aspect="equal",
+    )
+    if found:
+        axes.legend(fontsize="small", loc="upper right", framealpha=0.9)
+
+
+def draw_histogram(axes: Axes, shown: Map) -> None:
+    """Draw the logarithmic histogram of a map, with the normal distribution of its spread.
+
+    As in EMVA 1288, release 4.0, section 8.4: single pixels far out show on a logarithmic scale.
+    """
+    known = shown.values[np.isfinite(shown.values)].astype(np.float64)
+    low, high = float(known.min()), float(known.max())
+    if high <= low:
+        low, high = low - 0.5, high + 0.5
+    # Rice's rule: the bins of few pixels are wide.
+    bins = min(_MOST_BINS, round(2 * np.cbrt(known.size)))
+    counts, edges = np.histogram(known, bins, (low, high))
+    axes.stairs(counts, edges, fill=True, alpha=0.6)
+    middle, quarter, three = np.percentile(known, (50, 25, 75))
+    spread = (three - quarter) / 1.349
+    if spread > 0:
+        at = np.linspace(low, high, 4 * _MOST_BINS)
+        normal = np.exp(-0.5 * ((at - middle) / spread) ** 2) / (spread * np.sqrt(2 * np.pi))
+        axes.plot(at, normal * known.size * (edges[1] - edges[0]), color="black", linewidth=0.8)
+    axes.set(
+        title=f"Histogram of {shown.name[0].lower()}{shown.name[1:]}",
+        xlabel=f"{shown.unit or 'relative'}; line: normal, by the quartiles",
+        ylabel="pixels",
+        yscale="log",
+        ylim=(0.5, 2 * counts.max()),
+    )
+
+
+def draw_profiles(axes: Axes, shown: Map) -> None:
+    """Draw the medians of rows and of columns, which show stripes and slopes."""
+    for axis, name in ((1, "of each row"), (0, "of each column")):
+        axes.plot(nanmedian(shown.values, axis=axis), linewidth=0.8, label=name)
+    axes.set(title=f"Medians: {shown.title}", xlabel="row, column")
+    axes.legend(fontsize="small")
+
+
+def draw_shifts(axes: Axes, calibration: Calibration) -> None:
+    """Draw the positions of the sensor, numbered by exposure, with refined standard deviations."""
+    rows, cols = calibration.shifts.T
+    std = calibration.shift_std
+    down, right = (None, None) if std is None else std.T
+    axes.errorbar(cols, rows, yerr=down, xerr=right, fmt="o", capsize=3)
+    for number, (row, col) in enumerate(calibration.shifts):
+        axes.annotate(str(number), (col, row), xytext=(5, 3), textcoords="offset points")
+    known = "" if std is None else f"\nlargest standard deviation {np.nanmax(std):.2g} pixel"
+    axes.set(title="Shifts, pixels", xlabel=f"column{known}", ylabel="row")
+    axes.margins(0.15)
+    axes.invert_yaxis()
+    axes.set_aspect("equal", "datalim")
+
+
+def draw_spectrum(axes: Axes, shown: Map) -> None:
+    """Draw the spectrum of the pattern along rows and columns: stripes are peaks.
+
+    The root of the mean power of the Fourier transforms of all rows, and of all columns, over the
+    root of the number of pixels along them, as in the spectrograms of EMVA 1288, release 4.0,
+    section 8.2. Pixels without a value count as the mean.
+    """
+    values = shown.values.astype(np.float64)
+    values = np.nan_to_num(values - np.nanmean(values))
+    for axis, name in ((1, "along rows"), (0, "along columns")):
+        power = np.abs(np.fft.rfft(values, axis=axis)) ** 2
+        size = values.shape[axis]
+        line = np.sqrt(power.mean(axis=1 - axis) / size)
+        axes.semilogy(np.fft.rfftfreq(size)[1:], line[1:], linewidth=0.8, label=name)
+    axes.set(
+        title=f"Spectrum of {shown.name[0].lower()}{shown.name[1:]}",
+        xlabel="cycles per pixel",
+        ylabel=shown.unit or "relative",
+    )
+    axes.legend(fontsize="small")
+
+
+def draw_convergence(axes: Axes, calibration: Calibration) -> None:
+    """Draw the estimated error of M over the passes of the solver."""
+    history = calibration.history
+    axes.semilogy(history["sweep"], history["error_estimate"], marker="o", markersize=3)
+    axes.set(title="Convergence", xlabel="pass over the data", ylabel="estimated error of M")
+    axes.grid(alpha=0.3)

@@ -1,0 +1,148 @@
+"""What results hold, as maps with names and units, reduced to what a picture can show."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Literal, cast
+
+import numpy as np
+
+from equipix._check import Array, Floats
+from equipix.bolometer.dynamic import DynamicCorrection
+from equipix.calibration.result import Calibration
+from equipix.correction.protocol import Correction
+from equipix.findings import Flag
+from equipix.measured.statistics import FrameStatistics
+from equipix.metrics.maps import block_means
+from equipix.nuc.response import Response
+from equipix.scene.scene_correction import SceneCorrection
+
+LARGEST = 1000
+"""Most rows and columns of a map in a picture: larger ones are reduced by block means."""
+
+_AT_ONCE = 2**24
+"""Pixels of which block means are formed at once."""
+
+Scale = Literal["level", "deviation", "size"]
+"""Values around a level of their own, around 0, or above it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Map:
+    """A value of each pixel, or of each cell of the beam.
+
+    Attributes
+    ----------
+    name, unit : str
+        What it is, in words for a title; the unit is empty for a ratio.
+    values : ndarray, shape (rows, cols)
+        The values; NaN where there is none.
+    scale : {"level", "deviation", "size"}
+        Whether they lie around a level of their own, around 0, or above it.
+    """
+
+    name: str
+    unit: str
+    values: Array
+    scale: Scale = "level"
+
+    @property
+    def title(self) -> str:
+        """Name and unit."""
+        return f"{self.name}, {self.unit}" if self.unit else self.name
+
+    @property
+    def extremes(self) -> tuple[float, float]:
+        """Smallest and largest value; NaN where there is none."""
+        known = self.values[np.isfinite(self.values)]
+        return (float(known.min()), float(known.max())) if known.size else (np.nan, np.nan)
+
+    def reduced(self, largest: int = LARGEST) -> tuple[Floats, int]:
+        """Block means of at most so many rows and columns, and the pixels along a block."""
+        step = -(-max(self.values.shape) // largest)
+        rows = max(step, _AT_ONCE // self.values.shape[1] // step * step)
+        parts = [self.values[first : first + rows] for first in range(0, len(self.values), rows)]
+        # A part below one block, of the last rows, is left out like columns at the edge.
+        means = [block_means(part, step) for part in parts if len(part) >= step]
+        return np.concatenate(means), step
+
+
+def maps_of(result: Any) -> list[Map]:
+    """Maps of a result, the most important first.
+
+    Parameters
+    ----------
+    result : Calibration, Response, DynamicCorrection, FrameStatistics, SceneCorrection, Correction
+        What `equipix.load` reads.
+
+    Returns
+    -------
+    list of Map
+        Flags are not among them: `flagged` counts and places them.
+    """
+    for kind, maps in _MAPS.items():
+        if isinstance(result, kind):
+            return [each for each in maps(result) if np.isfinite(each.values).any()]
+    return [*_of_correction(result)]
+
+
+def _of_calibration(calibration: Calibration) -> Iterator[Map]:
+    yield Map("Sensitivity M", "", calibration.sensitivity)
+    if calibration.sensitivity_std is not None:
+        yield Map("Standard deviation of M", "", calibration.sensitivity_std, "size")
+    yield Map("Beam L", "DN", calibration.beam)
+    if calibration.dark is not None:
+        yield Map("Dark", "DN", calibration.dark)
+
+
+def _of_response(response: Response) -> Iterator[Map]:
+    names = ("Offset a", "Gain deviation K", "Curvature c", "Cubic term e")
+    units = ("DN", "", "1/DN", "1/DN²")
+    for name, unit, plane in zip(names, units, response.deviation, strict=False):
+        yield Map(name, unit, plane, "deviation")
+    yield Map("Reduced χ² of the fit", "", response.reduced_chi2, "size")
+    if response.order > 1:
+        yield Map("Error of the inverse", "DN", response.inverse_error, "size")
+
+
+def _of_dynamic(correction: DynamicCorrection) -> Iterator[Map]:
+    low, high = correction.axes.substrate_c
+    middle = (low + high) / 2
+    state = correction.correction(middle)
+    yield Map(f"Offset at {middle:.4g} °C", "DN", state.coefficients[0])
+    yield Map(f"Gain at {middle:.4g} °C", "", state.coefficients[1])
+
+
+def _of_statistics(frames: FrameStatistics) -> Iterator[Map]:
+    yield Map("Mean", "DN", frames.mean)
+    yield Map("Standard deviation of a frame", "DN", np.sqrt(frames.variance), "size")
+    if np.ptp(frames.count):
+        yield Map("Samples that count", "", frames.count, "size")
+
+
+def _of_scene(correction: SceneCorrection) -> Iterator[Map]:
+    low, high = cast("tuple[float, float]", correction.data_range)
+    yield Map("Gain", "", correction.gain)
+    yield Map("Offset", "DN", correction.offset * (high - low), "deviation")
+
+
+def _of_correction(correction: Correction) -> Iterator[Map]:
+    names = ("Offset of the correction", "Gain of the correction")
+    for power, plane in enumerate(correction.coefficients):
+        name = names[power] if power < len(names) else f"Coefficient of order {power}"
+        yield Map(name, ("DN", "", "1/DN", "1/DN²")[power], plane)
+
+
+_MAPS: dict[type, Callable[[Any], Iterator[Map]]] = {
+    Calibration: _of_calibration,
+    Response: _of_response,
+    DynamicCorrection: _of_dynamic,
+    FrameStatistics: _of_statistics,
+    SceneCorrection: _of_scene,
+}
+"""What gives the maps of each kind of result; all others are corrections by coefficients."""
+
+
+def flagged(flags: Array) -> dict[Flag, tuple[Array, Array]]:
+    """Rows and columns of the pixels that have each flag; ``DO_NOT_USE`` stands beside others."""
+    found = {flag: np.nonzero(flags & flag) for flag in Flag if flag != Flag.DO_NOT_USE}
+    return {flag: (rows, cols) for flag, (rows, cols) in found.items() if len(rows)}

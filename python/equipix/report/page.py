@@ -1,0 +1,294 @@
+"""A page of results: one HTML file that needs nothing else."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from equipix._check import Array, Floats
+from equipix._native import __version__
+from equipix.calibration.result import Calibration
+from equipix.errors import EquipixError
+from equipix.findings import Finding, Flag, usable
+from equipix.nuc.response import Response
+from equipix.pictures import missing_matplotlib, new_figure
+from equipix.report.drawing import CMAPS, curves_of, limits_of
+from equipix.report.figures import summary, words_of
+from equipix.report.limits import Check, Limits, LimitsFile, checked
+from equipix.report.maps import Map, flagged, maps_of
+
+if TYPE_CHECKING:
+    pass
+
+_LARGEST = 480
+"""Most rows and columns of a map on a page of one result."""
+
+_CELL = 160
+"""The same in a notebook."""
+
+_MOST_LISTED = 200
+"""Most flagged pixels that are listed one by one."""
+
+_WORDS = 2**16 - 2
+"""Steps between the smallest and the largest value of a map; the word 0 stands for no value."""
+
+
+class Table(NamedTuple):
+    """Rows of words under a title."""
+
+    title: str
+    head: tuple[str, ...]
+    rows: Sequence[tuple[str, ...]]
+    caption: str = ""
+
+
+class Part(NamedTuple):
+    """What a page says of one result."""
+
+    name: str
+    what: str
+    findings: tuple[Finding, ...]
+    checks: list[Check]
+    figures: list[tuple[str, str]]
+    maps: list[dict[str, Any]]
+    plots: list[dict[str, str]]
+    tables: list[Table]
+    provenance: list[tuple[str, str]]
+
+    @property
+    def verdict(self) -> str:
+        """PASS or FAIL; nothing where nothing is judged."""
+        if not self.checks:
+            return ""
+        return "PASS" if all(check.passed for check in self.checks) else "FAIL"
+
+
+def page(parts: list[Part], title: str) -> str:
+    """Write the page.
+
+    Raises
+    ------
+    EquipixError
+        If jinja2 is not installed.
+    """
+    verdicts = {part.verdict for part in parts} - {""}
+    return _rendered(
+        "page.html",
+        title=title,
+        version=__version__,
+        made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        verdict="FAIL" if "FAIL" in verdicts else "PASS" if verdicts else "",
+        parts=parts,
+    )
+
+
+def cell(result: Any) -> str:
+    """Write what a notebook shows of a result; the errors are those of `page`."""
+    first = maps_of(result)[0]
+    return _rendered(
+        "cell.html",
+        what=repr(result).strip("<>"),
+        map=_map(first, _CELL),
+        figures=words_of(summary(result)),
+        findings=getattr(result, "findings", ()),
+    )
+
+
+def _rendered(template: str, **content: Any) -> str:
+    """Fill a template."""
+    try:
+        from jinja2 import Environment, PackageLoader
+    except ImportError as error:
+        raise EquipixError(
+            "reports need jinja2, which is not installed: pip install 'equipix[report]'"
+        ) from error
+    loader = PackageLoader("equipix.report", ".")
+    environment = Environment(loader=loader, autoescape=True, trim_blocks=True)
+    return environment.get_template(template).render(**content)
+
+
+def part_of(name: str, result: Any, limits: LimitsFile, *, share: int = 1) -> Part:
+    """Collect what a page says of a result; of `share` results on it maps are smaller."""
+    figures, findings = summary(result), tuple(getattr(result, "findings", ()))
+    flags = getattr(result, "flags", None)
+    if flags is not None:
+        figures["flagged_share"] = float(np.mean(~usable(flags)))
+    maps = maps_of(result)
+    if flags is not None and flags.any():
+        bad = (flags != 0).astype(np.float32)
+        maps.append(Map("Flagged pixels", "share of a cell", bad, "size"))
+    return Part(
+        name=name,
+        what=repr(result).strip("<>"),
+        findings=findings,
+        checks=checked(_limits_of(result, limits), figures, findings),
+        figures=words_of(figures),
+        maps=[_map(each, int(_LARGEST / share**0.5)) for each in maps],
+        plots=[*_plots(result, maps[0])],
+        tables=[*_tables(result)],
+        provenance=_provenance(getattr(result, "metadata", {})),
+    )
+
+
+def _limits_of(result: Any, limits: LimitsFile) -> Limits:
+    """Limits of the kind of a result."""
+    kinds: dict[type, Limits] = {Calibration: limits.calibration, Response: limits.response}
+    return kinds.get(type(result), limits.correction)
+
+
+def _map(shown: Map, largest: int) -> dict[str, Any]:
+    """Picture, values and words of a map."""
+    values, step = shown.reduced(largest)
+    low, high = limits_of(shown, values)
+    smallest, biggest = shown.extremes
+    known = values[np.isfinite(values)]
+    ends = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
+    cmap = CMAPS[shown.scale]
+    means = f"Means of {step}×{step} pixels; single" if step > 1 else "Single"
+    return {
+        "title": shown.name,
+        "unit": shown.unit,
+        "words": f"{means} pixels from {smallest:.5g} to {biggest:.5g} {shown.unit}".strip(),
+        "rows": values.shape[0],
+        "cols": values.shape[1],
+        "step": step,
+        "low": repr(ends[0]),
+        "high": repr(ends[1]),
+        "coded": _coded(values, *ends),
+        "image": _picture(values, low, high, cmap),
+        "bar": _picture(np.linspace(low, high, 256)[None], low, high, cmap),
+        "first": f"{low:.4g}",
+        "last": f"{high:.4g}",
+    }
+
+
+def _coded(values: Floats, low: float, high: float) -> str:
+    """Words of 16 bits, little-endian in base 64: 0 for no value, 1 for the lowest."""
+    scale = _WORDS / (high - low) if high > low else 0.0
+    words = np.where(np.isfinite(values), 1 + np.rint((values - low) * scale), 0)
+    return base64.b64encode(np.nan_to_num(words).astype("<u2").tobytes()).decode()
+
+
+def _picture(values: Floats, low: float, high: float, cmap: str) -> str:
+    """Draw values in colours, as a PNG within an address."""
+    try:
+        from matplotlib.image import imsave
+    except ImportError as error:
+        raise missing_matplotlib() from error
+
+    buffer = io.BytesIO()
+    imsave(buffer, values, vmin=low, vmax=high, cmap=cmap, format="png")
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+
+
+def _plots(result: Any, first: Map) -> Iterator[dict[str, str]]:
+    """Curves of a result as drawings that take the colour of the text around them."""
+    for draw in curves_of(result, first):
+        figure = new_figure(5.2, 3.8)
+        axes = figure.subplots()
+        draw(axes)
+        buffer = io.StringIO()
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+        svg = buffer.getvalue()
+        svg = svg[svg.index("<svg") :].replace("#000000", "currentColor")
+        yield {"title": axes.get_title(), "svg": svg}
+
+
+def _tables(result: Any) -> Iterator[Table]:
+    """Shifts, fluxes and flagged pixels, one by one."""
+    if isinstance(result, Calibration):
+        yield _shifts(result)
+        yield _errors(result)
+    flags = getattr(result, "flags", None)
+    if flags is not None and flags.any():
+        yield _flagged(flags)
+
+
+def _shifts(calibration: Calibration) -> Table:
+    """Where the sensor stood: measured, and as fitted with its standard deviation."""
+    metadata = calibration.metadata
+    count = len(calibration.shifts)
+    names = metadata.get("exposures", [str(number) for number in range(count)])
+    measured, stated = (
+        metadata.get(name, [None] * count) for name in ("measured_shifts", "measured_shift_std")
+    )
+    std = calibration.shift_std
+    rows = [
+        (
+            str(names[k]),
+            _pair(measured[k], stated[k]),
+            _pair(calibration.shifts[k], None if std is None else std[k]),
+            f"{calibration.rotation[k]}°",
+            f"{calibration.flux[k]:.5g}",
+        )
+        for k in range(count)
+    ]
+    head = ("Exposure", "Measured (row, col)", "Used (row, col)", "Turned", "Flux")
+    return Table("Exposures", head, rows, "Shifts in pixels, with standard deviations if known.")
+
+
+def _pair(values: Any, std: Any) -> str:
+    """Row and column with their standard deviations."""
+    if values is None:
+        return "given"
+    errors = (None, None) if std is None else std
+    return ", ".join(
+        f"{value:.4f}" + (f" ± {error:.4f}" if error else "")
+        for value, error in zip(values, errors, strict=True)
+    )
+
+
+def _errors(calibration: Calibration) -> Table:
+    """What the error of M is made of, as far as it is known."""
+    rows = [("Solver", f"{calibration.error_estimate:.2g}", "largest, at any scale")]
+    std, tilt = calibration.sensitivity_std, calibration.tilt_std
+    if std is not None:
+        rows.append(("Noise, of a pixel", f"{np.nanmedian(std):.2g}", "median"))
+    if tilt is not None:
+        told = ", ".join(f"{each:.2g}" for each in tilt)
+        rows.append(("Noise, of the tilt", told, "edge to edge, along rows and columns"))
+    drift = calibration.drift
+    if drift is not None:
+        told = ", ".join(f"{each:.2g}" for each in drift.tilt_std)
+        rows.append(("Drift of the lamp", told, f"in the tilt; the drift is {drift.size:.2g}"))
+    if len(rows) == 1:
+        rows.append(("Noise", "not computed", "calibrate with --uncertainty"))
+    return Table("Errors of M by cause", ("Cause", "Standard deviation", "Of what"), rows)
+
+
+def _flagged(flags: Array) -> Table:
+    """Flagged pixels, one by one."""
+    rows, cols = np.nonzero(flags)
+    listed = [
+        (f"{row}, {col}", ", ".join(_names(int(flags[row, col]))))
+        for row, col in zip(rows[:_MOST_LISTED], cols[:_MOST_LISTED], strict=True)
+    ]
+    counts = ", ".join(f"{_words(flag)} {len(at)}" for flag, (at, _) in flagged(flags).items())
+    left = f" The first {_MOST_LISTED} are listed." if len(rows) > _MOST_LISTED else ""
+    return Table("Flagged pixels", ("Row, column", "Flags"), listed, f"{counts}.{left}")
+
+
+def _names(bits: int) -> list[str]:
+    return [_words(flag) for flag in Flag if bits & flag]
+
+
+def _words(flag: Flag) -> str:
+    return (flag.name or "").replace("_", " ").lower()
+
+
+def _provenance(metadata: Mapping[str, Any], above: str = "") -> list[tuple[str, str]]:
+    """Entries of the metadata by their places, those of tables within tables one by one."""
+    found: list[tuple[str, str]] = []
+    for key, value in metadata.items():
+        name = f"{above}{key.replace('_', ' ')}"
+        if isinstance(value, Mapping):
+            found += _provenance(value, f"{name}: ")
+        else:
+            found.append((name, value if isinstance(value, str) else json.dumps(value)))
+    return found
