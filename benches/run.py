@@ -15,17 +15,17 @@ from pathlib import Path
 import applying
 import averaging
 import cargo
-import experiment
 import large
 import multiscale
 import numpy as np
 import response
-import scene
 import subpixel
 import uncertainty
 from peers import table as peers
 
 import equipix
+import experiment
+import scene
 from equipix import simulate
 
 Row = tuple[str, str, str, str]
