@@ -22,7 +22,7 @@ CALLED: ContextVar[Any] = ContextVar("CALLED", default=None)
 
 COMMANDS = {
     "calibrate": ("calibrate", "Calibrate a sensor from the images of an experiment."),
-    "inspect": ("calibrate", "Show what a result holds, and a picture of its maps."),
+    "inspect": ("calibrate", "Show main figures of a result, and draw its maps."),
     "compare": ("calibrate", "Show how far calibrations of one sensor agree."),
     "report": ("report", "Write results as one page, judged by limits."),
     "average": ("frames", "Mean and variance of every pixel over many frames."),

@@ -79,7 +79,7 @@ def inspect(
     force: terminal.Force = False,
     as_json: terminal.Json = False,
 ) -> None:
-    """Show what a result holds: its main figures, and a picture of its maps."""
+    """Show main figures of a result, and draw its maps."""
     check_picture(output)
     terminal.check_output(output, [file], force=force)
     content = load(file)

@@ -36,7 +36,7 @@ def report(
     force: terminal.Force = False,
     as_json: terminal.Json = False,
 ) -> None:
-    """Write results as one page: figures, maps, findings, limits, where they come from."""
+    """Write results as one page, judged by limits."""
     if limits_template_ is not None:
         _write(limits_template_, limits_template(), force=force)
         terminal.show_result({"output": str(limits_template_)}, as_json=as_json)
