@@ -298,7 +298,7 @@ def test_a_reader_of_one_kind_refuses_the_others(tmp_path):
     KINDS["averages"].save(tmp_path / "a.tif")
     with pytest.raises(FileError, match=r"a\.tif: holds frame statistics, expected calibration th"):
         read_record(tmp_path / "a.tif", equipix.Calibration)
-    with pytest.raises(InputError, match=r"expected the suffix \.tif or \.npz"):
+    with pytest.raises(InputError, match=r"expected the suffix \.tif, \.npz or \.fits"):
         equipix.load(tmp_path / "a.txt")
 
 

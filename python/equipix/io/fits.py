@@ -4,6 +4,7 @@ The only module that imports astropy. Pages beside the viewed image are extensio
 their array; its exact name stands in the keyword ARRAY.
 """
 
+import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -61,7 +62,14 @@ def write_pages(
 
 def read_pages(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
     """Read what `write_pages` wrote: arrays by name, and the text; of other files none."""
-    with _astropy().open(path, memmap=False, checksum=True) as units:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # of checksums, and of broken headers
+        return _read_pages(path)
+
+
+def _read_pages(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
+    fits = _astropy()
+    with path.open("rb") as file, fits.open(file, memmap=False, checksum=True) as units:
         if _TEXT not in units:
             return {}, ""
         pages = {unit.header[_NAME]: _native(unit.data) for unit in units if _NAME in unit.header}

@@ -195,15 +195,18 @@ def draw_spectrum(axes: Axes, shown: Map) -> None:
     """
     values = shown.values.astype(np.float64)
     values = np.nan_to_num(values - np.nanmean(values))
+    positive = False
     for axis, name in ((1, "along rows"), (0, "along columns")):
         power = np.abs(np.fft.rfft(values, axis=axis)) ** 2
         size = values.shape[axis]
         line = np.sqrt(power.mean(axis=1 - axis) / size)
-        axes.semilogy(np.fft.rfftfreq(size)[1:], line[1:], linewidth=0.8, label=name)
+        axes.plot(np.fft.rfftfreq(size)[1:], line[1:], linewidth=0.8, label=name)
+        positive |= bool((line[1:] > 0).any())
     axes.set(
         title=f"Spectrum of {shown.name[0].lower()}{shown.name[1:]}",
         xlabel="cycles per pixel",
         ylabel=shown.unit or "relative",
+        yscale="log" if positive else "linear",
     )
     axes.legend(fontsize="small")
 
