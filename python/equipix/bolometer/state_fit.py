@@ -59,7 +59,7 @@ def fit(
     Returns
     -------
     DynamicCorrection
-        `at` gives its correction at a state.
+        Its `correction` gives that of a state.
 
     Raises
     ------

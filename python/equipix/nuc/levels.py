@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from equipix import _native
-from equipix._check import Array, Bools, Floats, Words, as_mask, union
+from equipix._check import Array, Bools, Floats, Ints, Words, as_mask, union
 from equipix.errors import InputError
 from equipix.findings import Finding, Rule, ask, say
 from equipix.measured.colour import Colours, Filters
@@ -59,8 +59,6 @@ class Levels(Measured):
     frame_noise : float or None
         Noise of one frame at the lowest level, in DN, where averages give it, else that of a value
         given; None if it is unknown.
-    filters : Filters or None
-        Colour filters of the pixels, where they are given or stand out of the levels.
     findings : tuple of Finding
         What limits them.
     """
@@ -69,13 +67,7 @@ class Levels(Measured):
     good: Bools
     level_noise: tuple[LevelNoise, ...] | None
     frame_noise: float | None = None
-    filters: Filters | None = None
     findings: tuple[Finding, ...] = ()
-
-    @property
-    def cfa(self) -> Colours | None:
-        """The colour filters that were given."""
-        return self.filters.colours if self.filters is not None and self.filters.given else None
 
     def of_pixels(self, pixels: Bools) -> Self:
         """Return the levels of some pixels as one row of them, with references of their own."""
@@ -104,7 +96,7 @@ class Levels(Measured):
         pairs = zip(self.level_noise, self.references, strict=True)
         return np.array([float(noise.variance(reference)) for noise, reference in pairs])
 
-    def chosen(self, exposures: NDArray[np.int64]) -> Self:
+    def chosen(self, exposures: Ints) -> Self:
         """Return some of the levels, with their references."""
         noise = self.level_noise
         return dataclasses.replace(
@@ -185,20 +177,17 @@ def levels_of(
     good = _good(values, bad_pixels, given)
     references = _references(values, good)
     frame_noise = _frame_noise(averaged if variance is None else None, noise, references)
-    found = {
+    found = vars(measured) | {
         "values": values,
         "bad_pixels": bad_pixels,
+        "filters": filters,
         "mask": None,
         "variance": None,
-        "noise": (),
+        "noise": (),  # in values and level_noise
+        "raw": measured.raw and averaged is not None,
     }
     checked = Levels(
-        **vars(measured) | found | {"raw": measured.raw and averaged is not None},
-        references=references,
-        good=good,
-        level_noise=noise,
-        frame_noise=frame_noise,
-        filters=filters,
+        **found, references=references, good=good, level_noise=noise, frame_noise=frame_noise
     )
     return dataclasses.replace(checked, findings=said + say(*ask(_CHECKED, checked)))
 
