@@ -17,7 +17,7 @@ from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.curves import horner_inverse, least_slope
 from equipix.nuc.level_rules import CURVES, INVERSE, Curves, inverse_error
 from equipix.nuc.levels import Levels, alike_pixels, levels_of
-from equipix.nuc.order import check_count, check_gain, check_order, chosen_order, form_of
+from equipix.nuc.order import check_count, check_gain, check_order, chosen_order
 from equipix.nuc.response import Response, common_misfit
 
 _MOST_MOVED = 0.01
@@ -146,7 +146,6 @@ def fitted(
     The other parameters and the errors are those of `fit`.
     """
     started = datetime.now(UTC)
-    check_order(order, by)
     workers = positive_workers(workers)
     with naming_memory("fitting response curves"):
         options: dict[str, Any] = {"order": order, "by": by}
@@ -191,9 +190,8 @@ def _joined(parts: list[tuple[Bools, dict[str, Array]]]) -> dict[str, Array]:
     """
     if len(parts) == 1 and parts[0][0].all():
         return parts[0][1]
-    counts, means = zip(
-        *((pixels.sum(), maps.pop("levels")) for pixels, maps in parts), strict=True
-    )
+    counts = [pixels.sum() for pixels, _ in parts]
+    means = [maps.pop("levels") for _, maps in parts]
     joined: dict[str, Array] = {"levels": np.average(means, axis=0, weights=counts)}
     shape = parts[0][0].shape
     for name, first in parts[0][1].items():
@@ -206,11 +204,11 @@ def _joined(parts: list[tuple[Bools, dict[str, Array]]]) -> dict[str, Array]:
 
 def _curves(levels: Levels, order: int, by: By, workers: int | None) -> dict[str, Array]:
     """Fit one order and invert it: maps and levels of a `Response`, and where curves rise."""
-    found = levels.fit(form_of(order, by), workers=workers)
+    found = levels.fit(order, by, workers=workers)
     spare = len(levels) - (order + 1)
     cleaned = _of_alike_pixels(levels, found[2], spare) if order > 0 and spare > 0 else None
     if cleaned is not None:
-        levels, found = cleaned, cleaned.fit(form_of(order, by), workers=workers)
+        levels, found = cleaned, cleaned.fit(order, by, workers=workers)
     deviation, variances, misfit, used = found
     freedom = used.astype(np.int64) - (order + 1)
     chi2 = np.where(freedom > 0, misfit / np.maximum(freedom, 1), np.nan)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from equipix import _native
-from equipix._check import Array, Bools, Floats, Words, as_mask, union
+from equipix._check import Array, Bools, By, Floats, Words, as_mask, union
 from equipix.errors import InputError
 from equipix.findings import Finding, Rule, ask, say
 from equipix.measured.colour import Colours, Filters
@@ -21,6 +21,9 @@ from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.level_rules import GIVEN, Given
 
 _LEVELS = Words("'levels'", "level")
+
+_FORMS = {1: "line", 2: "quadratic", 3: "cubic"}
+"""Form that the core fits for each order above 0; that of order 0 is named by what is corrected."""
 
 FEWEST_VALID = 0.5
 """Least share of the pixels that must have a value at every level."""
@@ -146,12 +149,14 @@ class Levels(Measured):
                 count, last = count + 1, level
         return count
 
-    def fit(self, form: str, *, workers: int | None) -> tuple[Floats, Floats, Floats, Array]:
-        """Fit polynomials of a form: coefficients, variances, misfit, levels used."""
+    def fit(
+        self, order: int, by: By, *, workers: int | None
+    ) -> tuple[Floats, Floats, Floats, Array]:
+        """Fit polynomials of an order: coefficients, variances, misfit, levels used."""
         return _native.fit_response(
             self.values,
             self.references.tolist(),
-            form=form,
+            form=_FORMS.get(order, by),
             noise=self.level_noise,
             workers=workers,
         )
