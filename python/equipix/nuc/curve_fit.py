@@ -176,10 +176,10 @@ def fitted(
 
 def _parts(levels: Levels) -> list[tuple[Bools, Levels]]:
     """The levels of each colour, with a map of its pixels; all of them without colours."""
-    everywhere = np.ones(levels.good.shape, bool)
-    if levels.cfa is None:
+    everywhere = np.ones(levels.shape, bool)
+    if levels.colours is None:
         return [(everywhere, levels)]
-    planes = [plane for _, plane in levels.cfa.planes(everywhere.shape)]
+    planes = [plane for _, plane in levels.colours.planes(everywhere.shape)]
     return [(plane, levels.of_pixels(plane)) for plane in planes if levels.good[plane].any()]
 
 
@@ -245,8 +245,8 @@ def _response(levels: Levels, maps: dict[str, Array], metadata: dict[str, Any]) 
         saturation=levels.saturation,
         metadata=metadata | {"finished": finished},
         findings=levels.findings,
-        cfa=levels.cfa,
-        colour_response=levels.filters.response if levels.cfa and levels.filters else None,
+        cfa=levels.colours,
+        colour_response=levels.filters.response if levels.colours and levels.filters else None,
     )
 
 
@@ -290,7 +290,7 @@ def _with_dark(variances: Floats, levels: Levels, by: By) -> Floats:
 
 def _flags(deviation: Floats, levels: Levels, rising: Array) -> Array:
     """Bits of `equipix.Flag` of each pixel."""
-    flags = np.zeros(levels.good.shape, np.uint32)
+    flags = np.zeros(levels.shape, np.uint32)
     bad_pixels, undetermined = levels.bad_pixels, np.isnan(deviation[0])
     for finding, pixels in vars(bad_pixels).items():
         set_bits(flags, finding, pixels)

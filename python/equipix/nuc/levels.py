@@ -75,11 +75,6 @@ class Levels(Measured):
     filters: Filters | None = None
     findings: tuple[Finding, ...] = ()
 
-    @property
-    def cfa(self) -> Colours | None:
-        """The colour filters that were given."""
-        return self.filters.colours if self.filters is not None and self.filters.given else None
-
     def of_pixels(self, pixels: Bools) -> Self:
         """Return the levels of some pixels as one row of them, with references of their own."""
 
@@ -96,6 +91,7 @@ class Levels(Measured):
             bad_pixels=BadPixels(dead=chosen(self.bad_pixels.dead)),
             dark=chosen(self.dark),
             dark_variance=chosen(self.dark_variance),
+            colours=None,
             filters=None,
         )
 
