@@ -1,5 +1,6 @@
 """The order of a dynamic correction by predictions of temperatures that are held out."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import takewhile
@@ -8,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from equipix._check import Bools, Floats
-from equipix.bolometer.states import Axes, States, rank_of, solver_of
+from equipix.bolometer.states import States, rank_of, solver_of
 from equipix.errors import InputError
 from equipix.findings import Rule
 
@@ -109,28 +110,27 @@ class Observed:
 
     def _error(self, order: int) -> float:
         """Mean square error of the predictions, median over the pixels."""
-        axes, total = self.states.axes(order), np.zeros(self.deviation.shape[1])
-        held = self._held()
-        for group in held:
-            out = self.states.at_one_of(group)
-            predicted = self._weights(axes, group) @ self.deviation[~out]
-            total += np.mean((self.deviation[out] - predicted) ** 2, axis=0)
-        return float(np.median(total)) / len(held)
-
-    def _weights(self, axes: Axes, group: Floats) -> Floats:
-        """Matrix that predicts the states of some temperatures from all others."""
-        out = self.states.at_one_of(group)
-        one, solver = self.states.chosen(out), solver_of(axes, self.states.chosen(~out))
-        return np.asarray(axes.basis(one.substrate_c, one.bias_v) @ solver)
+        squares = (
+            np.mean((self.deviation[out] - weights @ self.deviation[~out]) ** 2, axis=0)
+            for out, weights in self._predictions(order)
+        )
+        return float(np.median(sum(squares))) / len(self._held())
 
     def error_of_noise(self, order: int, variance: Floats) -> float:
         """Mean square error of the predictions that noise alone makes."""
-        axes, total, held = self.states.axes(order), 0.0, self._held()
-        for group in held:
+        errors = [
+            float(np.mean(variance[out] + weights**2 @ variance[~out]))
+            for out, weights in self._predictions(order)
+        ]
+        return sum(errors) / len(errors)
+
+    def _predictions(self, order: int) -> Iterator[tuple[Bools, Floats]]:
+        """States that are held out together, and the matrix that predicts them from all others."""
+        axes = self.states.axes(order)
+        for group in self._held():
             out = self.states.at_one_of(group)
-            of_prediction = self._weights(axes, group) ** 2 @ variance[~out]
-            total += float(np.mean(variance[out] + of_prediction))
-        return total / len(held)
+            one, solver = self.states.chosen(out), solver_of(axes, self.states.chosen(~out))
+            yield out, axes.basis(one.substrate_c, one.bias_v) @ solver
 
     def turn(self) -> str:
         """Say where the pattern of the array turns back as the temperature rises, if it does.
