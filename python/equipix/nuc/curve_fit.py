@@ -261,7 +261,7 @@ def _of_alike_pixels(levels: Levels, misfit: Floats, freedom: int) -> Levels | N
     alike = alike_pixels(squares)
     if alike.all():
         return None
-    cleaned = levels.judged_without(~alike)
+    cleaned = levels.counting(alike)
     typical = np.median(squares) / (freedom * median_of_noise(np.array(freedom)))
     noise = levels.variances if levels.level_noise else typical
     moved = (cleaned.references - levels.references) ** 2

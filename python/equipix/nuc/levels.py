@@ -71,8 +71,8 @@ class Levels(Measured):
     references: Floats
     good: Bools
     level_noise: tuple[LevelNoise, ...] | None
-    frame_noise: float | None = None
-    filters: Filters | None = None
+    frame_noise: float | None
+    filters: Filters | None
     findings: tuple[Finding, ...] = ()
 
     def of_pixels(self, pixels: Bools) -> Self:
@@ -112,10 +112,10 @@ class Levels(Measured):
             level_noise=None if noise is None else tuple(noise[level] for level in exposures),
         )
 
-    def judged_without(self, odd: Bools) -> Self:
-        """Return the levels with references from which some of the good pixels are left out."""
+    def counting(self, alike: Bools) -> Self:
+        """Return the levels with references of those of the good pixels that are alike."""
         good = self.good.copy()
-        good[self.good] = ~odd
+        good[self.good] = alike
         return dataclasses.replace(self, good=good, references=_references(self.values, good))
 
     def limits(self) -> Floats:
@@ -185,22 +185,18 @@ def levels_of(
     bad_pixels = _with_odd_responses(values, noise, measured.bad_pixels, filters)
     good = _good(values, bad_pixels, given)
     references = _references(values, good)
-    frame_noise = _frame_noise(averaged if variance is None else None, noise, references)
-    found = {
+    own = {
         "values": values,
-        "bad_pixels": bad_pixels,
         "mask": None,
-        "variance": None,
-        "noise": (),
+        "bad_pixels": bad_pixels,
+        "raw": measured.raw and averaged is not None,
+        "references": references,
+        "good": good,
+        "level_noise": noise,
+        "frame_noise": _frame_noise(averaged if variance is None else None, noise, references),
+        "filters": filters,
     }
-    checked = Levels(
-        **vars(measured) | found | {"raw": measured.raw and averaged is not None},
-        references=references,
-        good=good,
-        level_noise=noise,
-        frame_noise=frame_noise,
-        filters=filters,
-    )
+    checked = Levels(**vars(measured) | own)
     return dataclasses.replace(checked, findings=said + say(*ask(_CHECKED, checked)))
 
 

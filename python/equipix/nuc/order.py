@@ -86,7 +86,7 @@ def chosen_order(levels: Levels, by: By, *, workers: int | None) -> tuple[int, l
     squares = np.stack([_squares(levels, held, order, by, workers) for order in orders])
     alike = alike_pixels(squares)
     if not alike.all():
-        levels = levels.judged_without(~alike)
+        levels = levels.counting(alike)
         squares = np.stack([_squares(levels, held, order, by, workers) for order in orders])
         alike = alike_pixels(squares)
     errors = squares[:, alike].mean(axis=1).tolist()
