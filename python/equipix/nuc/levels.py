@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from equipix import _native
-from equipix._check import Array, Bools, Floats, Ints, Words, as_mask, union
+from equipix._check import Array, Bools, By, Floats, Ints, Words, as_mask, union
 from equipix.errors import InputError
 from equipix.findings import Finding, Rule, ask, say
 from equipix.measured.colour import Colours, Filters
@@ -21,6 +21,9 @@ from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.level_rules import GIVEN, Given
 
 _LEVELS = Words("'levels'", "level")
+
+_FORMS = {1: "line", 2: "quadratic", 3: "cubic"}
+"""Form that the core fits for each order above 0; that of order 0 is named by what is corrected."""
 
 FEWEST_VALID = 0.5
 """Least share of the pixels that must have a value at every level."""
@@ -85,6 +88,7 @@ class Levels(Measured):
             bad_pixels=BadPixels(dead=chosen(self.bad_pixels.dead)),
             dark=chosen(self.dark),
             dark_variance=chosen(self.dark_variance),
+            colours=None,
             filters=None,
         )
 
@@ -105,10 +109,10 @@ class Levels(Measured):
             level_noise=None if noise is None else tuple(noise[level] for level in exposures),
         )
 
-    def judged_without(self, odd: Bools) -> Self:
-        """Return the levels with references from which some of the good pixels are left out."""
+    def counting(self, alike: Bools) -> Self:
+        """Return the levels with references of those of the good pixels that are alike."""
         good = self.good.copy()
-        good[self.good] = ~odd
+        good[self.good] = alike
         return dataclasses.replace(self, good=good, references=_references(self.values, good))
 
     def limits(self) -> Floats:
@@ -138,12 +142,14 @@ class Levels(Measured):
                 count, last = count + 1, level
         return count
 
-    def fit(self, form: str, *, workers: int | None) -> tuple[Floats, Floats, Floats, Array]:
-        """Fit polynomials of a form: coefficients, variances, misfit, levels used."""
+    def fit(
+        self, order: int, by: By, *, workers: int | None
+    ) -> tuple[Floats, Floats, Floats, Array]:
+        """Fit polynomials of an order: coefficients, variances, misfit, levels used."""
         return _native.fit_response(
             self.values,
             self.references.tolist(),
-            form=form,
+            form=_FORMS.get(order, by),
             noise=self.level_noise,
             workers=workers,
         )
@@ -176,8 +182,7 @@ def levels_of(
     bad_pixels = _with_odd_responses(values, noise, measured.bad_pixels, filters)
     good = _good(values, bad_pixels, given)
     references = _references(values, good)
-    frame_noise = _frame_noise(averaged if variance is None else None, noise, references)
-    found = vars(measured) | {
+    own = {
         "values": values,
         "bad_pixels": bad_pixels,
         "filters": filters,
@@ -185,10 +190,12 @@ def levels_of(
         "variance": None,
         "noise": (),  # in values and level_noise
         "raw": measured.raw and averaged is not None,
+        "references": references,
+        "good": good,
+        "level_noise": noise,
+        "frame_noise": _frame_noise(averaged if variance is None else None, noise, references),
     }
-    checked = Levels(
-        **found, references=references, good=good, level_noise=noise, frame_noise=frame_noise
-    )
+    checked = Levels(**vars(measured) | own)
     return dataclasses.replace(checked, findings=said + say(*ask(_CHECKED, checked)))
 
 
