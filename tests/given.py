@@ -65,3 +65,12 @@ def used(cal, measured):
     for k, lost in enumerate(cal.weighted.fit.lost):
         mask[k].flat[lost] = True
     return measured | {"mask": mask}
+
+
+def written_experiment(folder, shape, shifts, **options):
+    """Write four frames of each exposure of a small virtual camera; return the manifest."""
+    rng = np.random.default_rng(3)
+    sensitivity = simulate.paper_sensitivity(shape, rng=rng)
+    beam = simulate.gaussian_beam(shape, width=150)
+    virtual = simulate.experiment(sensitivity, beam, shifts, frames=4, rng=rng, **options)
+    return virtual.write(folder / "experiment")

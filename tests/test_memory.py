@@ -112,10 +112,10 @@ RESPONSE = """
 import equipix
 from equipix.nuc.levels import levels_of
 levels = levels_of(np.random.default_rng(0).uniform(1, 2, (2, 1500, 1500)) * [[[1]], [[9]]])
-levels.fit("line", workers=1)
+levels.fit(1, "offset", workers=1)
 limit(200 * 10**6)
 try:
-    levels.fit("line", workers=1)
+    levels.fit(1, "offset", workers=1)
 except equipix.errors.InsufficientMemoryError as error:
     print(error)
 """

@@ -10,6 +10,7 @@ import pytest
 
 import equipix
 from equipix import Experiment, cli, errors, simulate
+from given import written_experiment
 
 SHAPE, CROSS = (48, 64), equipix.cross_pattern(5, 7)
 
@@ -17,16 +18,8 @@ SHAPE, CROSS = (48, 64), equipix.cross_pattern(5, 7)
 @pytest.fixture(scope="module")
 def manifest(tmp_path_factory):
     """An experiment with given shifts, fluxes and times."""
-    rng = np.random.default_rng(3)
-    virtual = simulate.experiment(
-        simulate.paper_sensitivity(SHAPE, rng=rng),
-        simulate.gaussian_beam(SHAPE, width=150),
-        CROSS,
-        frames=4,
-        dead=0,
-        rng=rng,
-    )
-    path = virtual.write(tmp_path_factory.mktemp("words") / "experiment")
+    folder = tmp_path_factory.mktemp("words")
+    path = written_experiment(folder, SHAPE, CROSS, dead=0)
     text = path.read_text()
     for k, (row, col) in enumerate(CROSS.tolist()):
         images = "".join(

@@ -339,7 +339,7 @@ def as_mask(
     array = as_array(name, mask, ndim=tuple(map(len, shapes)))
     if array.dtype != np.bool_:
         raise InputError(
-            f"'{name}' has dtype {array.dtype}, expected bool, True = do not use: give mask != 0"
+            f"'{name}' has dtype {array.dtype}, expected bool, True = do not use: give {name} != 0"
         )
     if array.shape not in shapes:
         wanted = " or ".join(map(str, shapes))

@@ -194,10 +194,7 @@ PRODUCERS = {
     "AdaptiveLoop": lambda _: (hardware.AdaptiveLoop(SHAPE).correction(), RAW),
     "DynamicCorrection": lambda _: (of_bolometers(), RAW),
     "LensFalloff": lambda _: (falloff().correction(), {}),
-    **{
-        name: lambda _, name=name: (learned(name), RAW | {"saturation": 16000.0, "bits": 14})
-        for name in scene.__all__
-    },
+    **{name: lambda _, name=name: (learned(name), RAW) for name in scene.__all__},
 }
 """Every way to a correction, and what its members say."""
 

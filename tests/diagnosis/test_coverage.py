@@ -11,6 +11,7 @@ import pytest
 import equipix
 from equipix import cli, errors, simulate
 from equipix.diagnosis import coverage
+from given import written_experiment
 
 SHAPE, CROSS = (40, 50), equipix.cross_pattern(5, 7)
 
@@ -91,15 +92,8 @@ def test_the_finding_is_saved(tmp_path):
 @pytest.fixture(scope="module")
 def manifest(tmp_path_factory):
     """An experiment of which only the first and the last exposure are listed."""
-    rng = np.random.default_rng(3)
-    virtual = simulate.experiment(
-        simulate.paper_sensitivity(SHAPE, rng=rng),
-        simulate.gaussian_beam(SHAPE, width=150),
-        CROSS,
-        frames=4,
-        rng=rng,
-    )
-    path = virtual.write(tmp_path_factory.mktemp("partial") / "experiment")
+    folder = tmp_path_factory.mktemp("partial")
+    path = written_experiment(folder, SHAPE, CROSS)
     path.write_text(
         re.sub(r"\[\[exposure\]\]\nname = \"p[1-3]\"\n(?:\w+ = .*\n)+\n*", "", path.read_text())
     )

@@ -12,6 +12,7 @@ import tifffile
 import equipix
 from equipix import Experiment, Flag, cli, errors, simulate
 from equipix.io.frames import read_mask
+from given import written_experiment
 
 SHAPE, SHIFTS = (48, 64), [(0, 0), (0, 5), (0, 7), (5, 0), (7, 0)]
 
@@ -19,17 +20,8 @@ SHAPE, SHIFTS = (48, 64), [(0, 0), (0, 5), (0, 7), (5, 0), (7, 0)]
 @pytest.fixture(scope="module")
 def manifest(tmp_path_factory):
     """An experiment with given shifts."""
-    rng = np.random.default_rng(3)
-    virtual = simulate.experiment(
-        simulate.paper_sensitivity(SHAPE, rng=rng),
-        simulate.gaussian_beam(SHAPE, width=150),
-        SHIFTS,
-        frames=4,
-        dead=0,
-        hot=0,
-        rng=rng,
-    )
-    path = virtual.write(tmp_path_factory.mktemp("masks") / "experiment")
+    folder = tmp_path_factory.mktemp("masks")
+    path = written_experiment(folder, SHAPE, SHIFTS, dead=0, hot=0)
     text = path.read_text()
     for k, (row, col) in enumerate(SHIFTS):
         text = re.sub(

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Experiment, cli, errors, simulate
+from equipix import Experiment, cli, errors
 from equipix.io.tiff import write_frames
+from given import written_experiment
 from records import rewrite
 
 SHAPE, SHIFTS = (48, 64), [(0, 0), (0, 5), (0, 7), (5, 0), (7, 0)]
@@ -17,15 +18,8 @@ SHAPE, SHIFTS = (48, 64), [(0, 0), (0, 5), (0, 7), (5, 0), (7, 0)]
 
 @pytest.fixture(scope="module")
 def manifest(tmp_path_factory):
-    rng = np.random.default_rng(3)
-    virtual = simulate.experiment(
-        simulate.paper_sensitivity(SHAPE, rng=rng),
-        simulate.gaussian_beam(SHAPE, width=150),
-        SHIFTS,
-        frames=4,
-        rng=rng,
-    )
-    return virtual.write(tmp_path_factory.mktemp("averages") / "experiment")
+    folder = tmp_path_factory.mktemp("averages")
+    return written_experiment(folder, SHAPE, SHIFTS)
 
 
 @pytest.fixture(scope="module")

@@ -651,3 +651,13 @@ def test_workers_are_checked_before_the_state(tmp_path):
     state = read_record(tmp_path / "state.npz", SceneState)
     with pytest.raises(errors.InputError, match="'workers' is 0"):
         resumed("state.npz", state, workers=0)
+
+
+def test_what_was_learned_from_can_be_corrected():
+    """Values above the level that counts as saturated too, as of a hot pixel."""
+    method = made("local-mean", (48, 64), saturation=0.9)
+    for frame in MovingScene(seed=1, shape=(48, 64)).frames(20):
+        values = frame.values.copy()
+        values[3, 4] = 1.05
+        method.update(values)
+    assert np.isfinite(method.correction().correct(values)).all()

@@ -1,4 +1,4 @@
-"""Uncooled bolometers: a simulated array, and corrections that follow temperature and bias."""
+"""Uncooled bolometers: corrections that follow temperature and bias."""
 
 from equipix.bolometer.dynamic import DynamicCorrection
 from equipix.bolometer.state_fit import fit

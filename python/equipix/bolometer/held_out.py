@@ -1,13 +1,15 @@
 """The order of a dynamic correction by predictions of temperatures that are held out."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import takewhile
 from typing import NamedTuple
 
 import numpy as np
 
 from equipix._check import Bools, Floats
-from equipix.bolometer.states import Axes, Regressor, States, rank_of, solver_of
+from equipix.bolometer.states import States, rank_of, solver_of
 from equipix.errors import InputError
 from equipix.findings import Rule
 
@@ -37,45 +39,49 @@ _BACK = 0.1
 """Share of its range by which the pattern may turn back between two temperatures."""
 
 
-class Form(NamedTuple):
-    """What all fits have in common."""
-
-    bias_order: int
-    regressor: Regressor
-
-
 @dataclass(frozen=True, eq=False)
-class HeldOut:
-    """Deviations of usable pixels, shape (n, pixels), to be predicted from other temperatures.
+class Observed:
+    """Values of all pixels at some states, shape (n, rows, cols); their deviations are fitted.
 
-    `variance` is that of a deviation at each state, shape (n,), where it is known; `largest` the
-    largest of the values, which sets their rounding.
+    `good` are the usable pixels, `variance` the mean of that of the values at each state, where it
+    is known. The response of stable pixels may need order 0, their offset does not.
     """
 
-    deviation: Floats
+    values: Floats
     states: States
-    form: Form
+    good: Bools
     variance: Floats | None
-    largest: float
+    is_offset: bool = True
+
+    @cached_property
+    def mean(self) -> Floats:
+        """Mean over usable pixels at each state."""
+        return np.asarray(self.values[:, self.good].mean(axis=1))
+
+    @cached_property
+    def deviation(self) -> Floats:
+        """Deviations of usable pixels from it, to be predicted, shape (n, pixels)."""
+        return np.asarray(self.values[:, self.good] - self.mean[:, None])
 
     def chosen(self) -> tuple[int, list[float]]:
-        """Order that predicts best, and the mean square error of each order.
+        """Lowest order within 0.1 % of the smallest error, and the mean square error of each order.
 
-        The lowest within 0.1 % of the smallest error; 0, without errors, of one temperature.
+        Order 0, without errors, of one temperature.
 
         Raises
         ------
         InputError
             If there are two temperatures, so that the others of one that is held out are one.
         """
-        if len(self.states.groups) == 1:
+        groups = self.states.groups
+        if len(groups) == 1:
             return 0, []
-        if len(self.states.groups) == 2:
+        if len(groups) == 2:
             raise InputError(
                 "'order' is 'auto', which holds out a temperature, but 'substrate_c' has "
-                f"{[float(group[0]) for group in self.states.groups]} °C: give three, or an order"
+                f"{[float(group[0]) for group in groups]} °C: give three, or an order"
             )
-        orders = range(1, min(HIGHEST, len(self.states.groups) - 2) + 1)
+        orders = range(1, min(HIGHEST, len(groups) - 2) + 1)
         possible = [0, *takewhile(self._is_possible, orders)]
         errors = [self._error(each) for each in possible]
         enough = min(errors) * (1 + _BETTER) + self.rounding
@@ -85,7 +91,7 @@ class HeldOut:
     @property
     def rounding(self) -> float:
         """Mean square error of exact data."""
-        return (_ROUNDING * self.largest) ** 2
+        return (_ROUNDING * float(np.abs(self.values[:, self.good]).max())) ** 2
 
     def _held(self) -> list[Floats]:
         """Temperatures to hold out: those between the ends, and the ends if there is but one.
@@ -98,34 +104,33 @@ class HeldOut:
 
     def _is_possible(self, order: int) -> bool:
         """Whether the states without any temperature that is held out determine an order."""
-        axes = self.states.axes(order, *self.form)
+        axes = self.states.axes(order)
         others = [~self.states.at_one_of(group) for group in self._held()]
         return all(rank_of(axes, self.states.chosen(each)) == axes.terms for each in others)
 
     def _error(self, order: int) -> float:
         """Mean square error of the predictions, median over the pixels."""
-        axes, total = self.states.axes(order, *self.form), np.zeros(self.deviation.shape[1])
-        held = self._held()
-        for group in held:
-            out = self.states.at_one_of(group)
-            predicted = self._weights(axes, group) @ self.deviation[~out]
-            total += np.mean((self.deviation[out] - predicted) ** 2, axis=0)
-        return float(np.median(total)) / len(held)
-
-    def _weights(self, axes: Axes, group: Floats) -> Floats:
-        """Matrix that predicts the states of some temperatures from all others."""
-        out = self.states.at_one_of(group)
-        one, solver = self.states.chosen(out), solver_of(axes, self.states.chosen(~out))
-        return np.asarray(axes.basis(one.substrate_c, one.bias_v) @ solver)
+        squares = (
+            np.mean((self.deviation[out] - weights @ self.deviation[~out]) ** 2, axis=0)
+            for out, weights in self._predictions(order)
+        )
+        return float(np.median(sum(squares))) / len(self._held())
 
     def error_of_noise(self, order: int, variance: Floats) -> float:
         """Mean square error of the predictions that noise alone makes."""
-        axes, total, held = self.states.axes(order, *self.form), 0.0, self._held()
-        for group in held:
+        errors = [
+            float(np.mean(variance[out] + weights**2 @ variance[~out]))
+            for out, weights in self._predictions(order)
+        ]
+        return sum(errors) / len(errors)
+
+    def _predictions(self, order: int) -> Iterator[tuple[Bools, Floats]]:
+        """States that are held out together, and the matrix that predicts them from all others."""
+        axes = self.states.axes(order)
+        for group in self._held():
             out = self.states.at_one_of(group)
-            of_prediction = self._weights(axes, group) ** 2 @ variance[~out]
-            total += float(np.mean(variance[out] + of_prediction))
-        return total / len(held)
+            one, solver = self.states.chosen(out), solver_of(axes, self.states.chosen(~out))
+            yield out, axes.basis(one.substrate_c, one.bias_v) @ solver
 
     def turn(self) -> str:
         """Say where the pattern of the array turns back as the temperature rises, if it does.
@@ -165,32 +170,28 @@ class HeldOut:
 
 
 class Judged(NamedTuple):
-    """Deviations, and the order that was chosen for them: by predictions, unless it was given.
+    """Deviations, and the order that was chosen for them: by predictions, unless it was given."""
 
-    The response of stable pixels may need order 0, their offset does not.
-    """
-
-    held_out: HeldOut
+    observed: Observed
     order: int
     errors: list[float] | None
-    is_offset: bool
 
 
 def _on_prediction(e: Judged) -> str | None:
     """Say that predictions are worse than noise explains."""
     if not e.errors or len(e.errors) == 1:
         return None
-    held_out, error, noise = e.held_out, e.errors[e.order], np.inf
-    if held_out.variance is not None:
-        noise = held_out.error_of_noise(e.order, held_out.variance) + held_out.rounding
+    observed, error, noise = e.observed, e.errors[e.order], np.inf
+    if observed.variance is not None:
+        noise = observed.error_of_noise(e.order, observed.variance) + observed.rounding
     if error <= _MANY_SIGMAS**2 * noise:
         return None
     return (
         f"order {e.order} predicts temperatures that are held out best, yet with "
         f"{np.sqrt(error / noise):.3g} times the error that noise explains: "
         + (
-            held_out.turn()
-            or f"take references at more temperatures than {len(held_out.states.groups)}, and see "
+            observed.turn()
+            or f"take references at more temperatures than {len(observed.states.groups)}, and see "
             "that each of 'substrate_c' is that of its reference"
         )
     )
@@ -198,8 +199,8 @@ def _on_prediction(e: Judged) -> str | None:
 
 def _on_exchanged(e: Judged) -> str | None:
     """Say that temperatures are probably those of other references."""
-    asked = e.is_offset if e.errors is None else e.order > 0
-    return e.held_out.turn() if asked else None
+    asked = e.observed.is_offset if e.errors is None else e.order > 0
+    return e.observed.turn() if asked else None
 
 
 def _on_one_order(e: Judged) -> str | None:
@@ -207,7 +208,7 @@ def _on_one_order(e: Judged) -> str | None:
     if e.errors is None or len(e.errors) != 1:
         return None
     return (
-        f"'order' is 'auto', but {len(e.held_out.states.groups)} temperatures with these biases "
+        f"'order' is 'auto', but {len(e.observed.states.groups)} temperatures with these biases "
         "determine no order above 0 where one is held out: take references at more states, or "
         "give 'order' and 'bias_order'"
     )
@@ -215,15 +216,15 @@ def _on_one_order(e: Judged) -> str | None:
 
 def _on_repeats(e: Judged) -> str | None:
     """Say that references at one temperature differ by more than noise explains."""
-    held_out, states = e.held_out, e.held_out.states
-    axes = states.axes(0, *held_out.form)
-    freedom = len(held_out.deviation) - axes.terms
-    if e.errors != [] or held_out.variance is None or freedom < 1:
+    observed, states = e.observed, e.observed.states
+    axes = states.axes(0)
+    freedom = len(observed.deviation) - axes.terms
+    if e.errors != [] or observed.variance is None or freedom < 1:
         return None
     basis = axes.basis(states.substrate_c, states.bias_v)
-    left = held_out.deviation - basis @ (solver_of(axes, states) @ held_out.deviation)
+    left = observed.deviation - basis @ (solver_of(axes, states) @ observed.deviation)
     error = float(np.median((left**2).sum(axis=0))) / freedom
-    noise = float(held_out.variance.mean()) + held_out.rounding
+    noise = float(observed.variance.mean()) + observed.rounding
     if error <= _MANY_SIGMAS**2 * noise:
         return None
     return (
@@ -235,9 +236,9 @@ def _on_repeats(e: Judged) -> str | None:
 
 def _on_constant(e: Judged) -> str | None:
     """Say that temperatures explain nothing, where no noise is known that hides it."""
-    if not e.errors or len(e.errors) == 1 or e.order > 0 or not e.is_offset:
+    if not e.errors or len(e.errors) == 1 or e.order > 0 or not e.observed.is_offset:
         return None
-    if e.held_out.variance is not None or e.errors[0] <= e.held_out.rounding:
+    if e.observed.variance is not None or e.errors[0] <= e.observed.rounding:
         return None
     return (
         "order 0 predicts temperatures that are held out best, with an error of "

@@ -2,15 +2,14 @@
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from equipix._check import Array, Bools, Floats, Words, as_mask, check_word, is_whole, union
+from equipix._check import Array, Bools, Floats, Words, as_mask, is_whole, union
 from equipix.bolometer.dynamic import DynamicCorrection
-from equipix.bolometer.held_out import HIGHEST, STATES, Form, HeldOut, Judged
+from equipix.bolometer.held_out import HIGHEST, STATES, Judged, Observed
 from equipix.bolometer.states import Axes, Regressor, States, check_spread, solver_of
 from equipix.errors import InputError
 from equipix.findings import Finding, Flag, ask, say, set_bits, usable
@@ -59,7 +58,7 @@ def fit(
     Returns
     -------
     DynamicCorrection
-        `at` gives its correction at a state.
+        Its `correction` gives that of a state.
 
     Raises
     ------
@@ -117,24 +116,22 @@ def fit(
     True
     """
     taken = references_of("shutter", shutter)
-    states = States.of(substrate_c, bias_v, len(taken))
-    powers = _bias_order(states, bias_order)
+    states = States.of(substrate_c, bias_v, len(taken), bias_order, regressor)
     bodies = [] if black_bodies is None else _bodies(black_bodies, taken.shape, len(taken))
     flags = flags_of(taken, bodies, mask)
-    check_word("regressor", regressor, get_args(Regressor))
-    good, form = usable(flags), Form(powers, regressor)
+    good = usable(flags)
     named = {"shutter": taken, **{f"black_bodies[{k}]": each for k, each in enumerate(bodies)}}
     clipped = [_clipping(name, each, good) for name, each in named.items()]
     said = say(*(Finding("saturation", words, "input") for words in clipped if words))
-    shown = Shown(taken.values, states, good, form, _noise(taken, good))
-    chosen, errors, more = shown.order(order)
+    shown = Observed(taken.values, states, good, _noise(taken, good))
+    chosen, errors, more = _order(shown, order)
     said += more
-    axes, offset = shown.coefficients(chosen)
+    axes, offset = _coefficients(shown, chosen)
     level = np.asarray(solver_of(axes, states) @ shown.mean)
     metadata: dict[str, Any] = {
         "options": {
             "order": chosen if errors is None else "auto",
-            "bias_order": powers,
+            "bias_order": states.bias_order,
             "regressor": regressor,
             "black_bodies": bool(bodies),
         },
@@ -143,66 +140,32 @@ def fit(
     if not bodies:
         return DynamicCorrection(offset, None, level, axes, axes, flags, metadata, said)
     response, variance = response_of(bodies, good)
-    rise = Shown(response, states, good, form, variance, is_offset=False)
-    chosen, metadata["gain_prediction_errors"], more = rise.order(order)
-    gain_axes, gain = rise.coefficients(chosen)
+    rise = Observed(response, states, good, variance, is_offset=False)
+    chosen, metadata["gain_prediction_errors"], more = _order(rise, order)
+    gain_axes, gain = _coefficients(rise, chosen)
     return DynamicCorrection(offset, gain, level, axes, gain_axes, flags, metadata, said + more)
 
 
-@dataclass(frozen=True, eq=False)
-class Shown:
-    """Values of all pixels at some states, of which the deviation from the mean is fitted.
-
-    `variance` is the mean of that of the values at each state, where it is known. The response of
-    stable pixels may need order 0, their offset does not.
-    """
-
-    values: Floats
-    states: States
-    good: Bools
-    form: Form
-    variance: Floats | None
-    is_offset: bool = True
-
-    @property
-    def mean(self) -> Floats:
-        """Mean over usable pixels at each state."""
-        return np.asarray(self.values[:, self.good].mean(axis=1))
-
-    @property
-    def deviation(self) -> Floats:
-        """Values less the mean of their state."""
-        return self.values - self.mean[:, None, None]
-
-    def coefficients(self, order: int) -> tuple[Axes, Floats]:
-        """Coefficients of the deviation of each pixel, shape (terms, rows, cols)."""
-        axes = self.states.axes(order, *self.form)
-        solver = solver_of(axes, self.states)
-        check_spread(axes, self.states, solver)
-        return axes, np.tensordot(solver, self.deviation, 1)
-
-    def order(
-        self, order: int | Literal["auto"]
-    ) -> tuple[int, list[float] | None, tuple[Finding, ...]]:
-        """Order that is given, or that which best predicts; prediction errors, and findings."""
-        is_auto = isinstance(order, str) and order == "auto"
-        if not (is_auto or is_whole(order, 0, HIGHEST)):
-            raise InputError(f"'order' is {order!r}, expected 0 to {HIGHEST} or 'auto'")
-        largest = float(np.abs(self.values[:, self.good]).max())
-        deviation = self.deviation[:, self.good]
-        held_out = HeldOut(deviation, self.states, self.form, self.variance, largest)
-        chosen, errors = held_out.chosen() if is_auto else (int(order), None)
-        said = say(*ask(STATES, Judged(held_out, chosen, errors, self.is_offset)))
-        return chosen, errors or None, said
+def _coefficients(shown: Observed, order: int) -> tuple[Axes, Floats]:
+    """Coefficients of the deviation of each pixel, shape (terms, rows, cols)."""
+    axes = shown.states.axes(order)
+    solver = solver_of(axes, shown.states)
+    check_spread(axes, shown.states, solver)
+    return axes, np.tensordot(solver, shown.values - shown.mean[:, None, None], 1)
 
 
-def _bias_order(states: States, given: int | None) -> int:
-    """Highest power of V², checked."""
-    if given is None:
-        return min(1, len(states.biases) - 1)
-    if not is_whole(given, 0):
-        raise InputError(f"'bias_order' is {given!r}, expected a whole number from 0, or None")
-    return int(given)
+def _order(
+    shown: Observed, order: int | Literal["auto"]
+) -> tuple[int, list[float] | None, tuple[Finding, ...]]:
+    """Order that is given, or that which best predicts; prediction errors, and findings."""
+    errors: list[float] | None = None
+    if isinstance(order, str) and order == "auto":
+        chosen, errors = shown.chosen()
+    elif is_whole(order, 0, HIGHEST):
+        chosen = int(order)
+    else:
+        raise InputError(f"'order' is {order!r}, expected 0 to {HIGHEST} or 'auto'")
+    return chosen, errors or None, say(*ask(STATES, Judged(shown, chosen, errors)))
 
 
 def references_of(name: str, given: Any) -> Measured:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from equipix._check import Bools, Floats, as_array
+from equipix._check import Bools, Floats, as_array, check_word, is_whole
 from equipix.detector.photons import ZERO_C
 from equipix.errors import InputError
 
@@ -71,13 +71,25 @@ class Axes:
 
 @dataclass(frozen=True, eq=False)
 class States:
-    """The states of n references: temperatures in °C and biases in volts, checked."""
+    """The states of n references: temperatures in °C and biases in volts, checked.
+
+    All polynomials in them have the same highest power of the bias and the same regressor.
+    """
 
     substrate_c: Floats
     bias_v: Floats
+    bias_order: int
+    regressor: Regressor
 
     @classmethod
-    def of(cls, substrate_c: ArrayLike, bias_v: ArrayLike, count: int) -> States:
+    def of(
+        cls,
+        substrate_c: ArrayLike,
+        bias_v: ArrayLike,
+        count: int,
+        bias_order: int | None,
+        regressor: Regressor,
+    ) -> States:
         """Check one state for each of `count` references; one bias may serve all."""
         celsius = as_array("substrate_c", substrate_c, ndim=1).astype(np.float64)
         volts = as_array("bias_v", bias_v, ndim=(0, 1)).astype(np.float64).ravel()
@@ -101,7 +113,14 @@ class States:
         wrong = volts[~((volts > 0) & (volts < np.inf))]
         if wrong.size:
             raise InputError(f"'bias_v' holds {wrong[0]:g} V, expected finite volts above 0")
-        return cls(celsius, volts)
+        if bias_order is None:
+            bias_order = min(1, len(np.unique(volts)) - 1)
+        if not is_whole(bias_order, 0):
+            raise InputError(
+                f"'bias_order' is {bias_order!r}, expected a whole number from 0, or None"
+            )
+        check_word("regressor", regressor, get_args(Regressor))
+        return cls(celsius, volts, int(bias_order), regressor)
 
     @property
     def temperatures(self) -> Floats:
@@ -131,18 +150,12 @@ class States:
 
     def chosen(self, which: Bools) -> States:
         """Return some of the states."""
-        return States(self.substrate_c[which], self.bias_v[which])
+        return replace(self, substrate_c=self.substrate_c[which], bias_v=self.bias_v[which])
 
-    def axes(self, order: int, bias_order: int, regressor: Regressor) -> Axes:
+    def axes(self, order: int) -> Axes:
         """Ranges of these states, with orders and regressor."""
-        celsius, volts = self.temperatures, self.biases
-        return Axes(
-            (float(celsius[0]), float(celsius[-1])),
-            (float(volts[0]), float(volts[-1])),
-            order,
-            bias_order,
-            regressor,
-        )
+        celsius, volts = ((float(v.min()), float(v.max())) for v in (self.substrate_c, self.bias_v))
+        return Axes(celsius, volts, order, self.bias_order, self.regressor)
 
 
 def _scaled(values: Floats, ends: Floats) -> Floats:

@@ -276,8 +276,8 @@ def _metadata(evidence: Evidence, started: datetime) -> dict[str, Any]:
         "rotation": exposures.positions.rotation.tolist(),
         "robust": options.robust,
     }
-    if exposures.filters is not None and exposures.filters.given:
-        chosen["cfa"] = exposures.filters.colours.written
+    if exposures.cfa is not None:
+        chosen["cfa"] = exposures.cfa.written
     if exposures.positions.std is not None:
         chosen["shifts"] = fit.refinement
     metadata: dict[str, Any] = {

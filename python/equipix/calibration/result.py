@@ -211,7 +211,7 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
         exposures, fit, bars = evidence.exposures, evidence.fit, evidence.bars
         dtype, flags, orientation = exposures.values.dtype, evidence.flags, evidence.orientation
         weighted = evidence.weighted
-        filters, gauge = exposures.filters, gauge_of(weighted, flags)
+        gauge = gauge_of(weighted, flags)
         std, offset = None if bars is None else bars.sensitivity, fit.offset
         coefficients = fit.beam.coefficients
         row, col = (int(each) if each.is_integer() else each for each in fit.beam.origin)
@@ -249,7 +249,7 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
             orientation=orientation,
             drift=evidence.drift,
             findings=findings,
-            cfa=filters.colours if filters is not None and filters.given else None,
+            cfa=exposures.cfa,
             colour_response=gauge.response,
         )
 

@@ -17,7 +17,7 @@ from equipix.io.paths import refuse_inputs
 from equipix.io.record import read_record
 from equipix.measured.colour import Colours
 from equipix.measured.defects import DefectLimits
-from equipix.nuc.bad_pixels import find_defects
+from equipix.nuc.defect_search import find_defects
 from equipix.nuc.response import Response
 from equipix.report.figures import flagged as flag_counts
 from equipix.report.figures import told

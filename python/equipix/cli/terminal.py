@@ -109,9 +109,9 @@ def check_output(
     ------
     FileError
         If `path` exists and `force` is not given, is a file where a `folder` is wanted or the
-        other way about, or its folder does not exist or is closed.
+        other way about, is one of the inputs, or its folder does not exist or is closed.
     InputError
-        If `path` ends in none of `suffixes`, or is one of the inputs.
+        If `path` ends in none of `suffixes`.
     """
     if path is None:
         return

@@ -108,8 +108,8 @@ def composition_tolerance(
     4.5e-06
     """
     check_type("material", material, HgCdTe, "a material, such as detector.HgCdTe(...)")
-    references = _checked(references_k, scene_k, charge_e, filled_k, by)
     filled = scene_k if filled_k is None else filled_k
+    references = _checked(references_k, scene_k, charge_e, filled, by)
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     weights = weights / 2
 
@@ -130,16 +130,15 @@ def composition_tolerance(
 
 
 def _checked(
-    references_k: Sequence[float], scene_k: float, charge_e: float, filled_k: float | None, by: str
+    references_k: Sequence[float], scene_k: float, charge_e: float, filled_k: float, by: str
 ) -> list[float]:
     """Temperatures of the references, after all arguments are checked."""
     given = as_array("references_k", references_k, ndim=1)
     references = [float(each) for each in given]
     if len(references) > 2 or len(set(references)) < len(references):
         raise InputError(f"'references_k' is {references}, expected up to two that differ")
-    filled = scene_k if filled_k is None else filled_k
     positive("charge_e", charge_e)
-    kelvin = {"scene_k": [scene_k], "filled_k": [filled], "references_k": references}
+    kelvin = {"scene_k": [scene_k], "filled_k": [filled_k], "references_k": references}
     for name, values in kelvin.items():
         for value in values:
             if positive(name, value) < _COLDEST_K:

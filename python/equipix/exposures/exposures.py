@@ -101,17 +101,18 @@ class Exposures(Measured):
         Relative flux of each exposure, and what is known of it.
     offset : bool
         Whether the values hold an offset of each pixel, to be fitted.
-    filters : Filters or None
-        Colour filters of the pixels: values and deviations are over the response of the pixel's
-        colour, so that all pixels are alike; `noise` and `dark` are in DN.
     relative : bool
         Whether the variances are relative, in an unknown unit.
+
+    Notes
+    -----
+    Where there are `filters`, values and deviations are over the response of the pixel's colour, so
+    that all pixels are alike; `noise` and `dark` are in DN.
     """
 
     positions: Positions
     flux: Flux
     offset: bool = False
-    filters: Filters | None = None
     relative: bool = False
 
     @classmethod

@@ -145,8 +145,8 @@ def too_fine(weighted: Weighted) -> str | None:
 def why_none(weighted: Weighted) -> str | None:
     """Say why a fit has no standard deviations: its beam is too fine, or its minimum too far."""
     fit, error = weighted.fit, float(weighted.fit.error_estimate[-1])
-    if weighted.excess > _FINEST:
-        return too_fine(weighted)
+    if words := too_fine(weighted):
+        return words
     if not fits_noise(fit) and (error <= _FOUND or not fit.is_joint):
         return None
     return (

@@ -1,9 +1,9 @@
 """Measurements that disagree, and dust that falls and stays."""
 
+import functools
 from typing import Any
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from equipix._check import Array, Bools, Floats
@@ -232,7 +232,9 @@ def without_fallen_dust(
         found = _together((step > _STEP_BEYOND) & (step > _LEADING_STEP * step.max()), first)
         edges = not found.any() and moment.any()
         if edges:
-            first = sliding_window_view(np.pad(moment, 1), (3, 3)).max(axis=(2, 3))
+            padded, (rows, cols) = np.pad(moment, 1), moment.shape
+            around = (padded[r : r + rows, c : c + cols] for r in range(3) for c in range(3))
+            first = functools.reduce(np.maximum, around)
             found = (moment == 0) & (step > _STEP_NEAR) & (first > 0)
         if not found.any():
             break

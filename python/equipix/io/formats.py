@@ -41,6 +41,11 @@ def _read_npz(path: Path) -> _Content:
     return pages, str(pages.pop(_TEXT, ""))
 
 
+def _npz_text(path: Path) -> str:
+    with path.open("rb") as stream, np.lib.npyio.NpzFile(stream) as file:
+        return str(file.get(_TEXT, ""))
+
+
 _FORMATS = {
     **dict.fromkeys((".tif", ".tiff"), (tiff.write_pages, tiff.read_pages)),
     ".npz": (_write_npz, _read_npz),
@@ -158,8 +163,8 @@ def saved_kind(path: Path) -> str | None:
     suffix = suffix_of(path)
     if suffix == ".npz" or suffix in fits.SUFFIXES:
         with reading(path):
-            return _kind(_read_npz(path)[1] if suffix == ".npz" else fits.description(path))
-    is_searched = suffix_of(path) in SUFFIXES and frame_format(path)[1].kind == "f"
+            return _kind(_npz_text(path) if suffix == ".npz" else fits.description(path))
+    is_searched = suffix in SUFFIXES and frame_format(path)[1].kind == "f"
     return _kind(header(path).description) if is_searched else None
 
 

@@ -23,7 +23,7 @@ from equipix._check import (
     union,
 )
 from equipix.errors import InputError
-from equipix.measured.colour import Colours
+from equipix.measured.colour import Colours, Filters
 from equipix.measured.defects import BadPixels
 from equipix.measured.means import Averaged
 from equipix.measured.noise import NoiseModel
@@ -70,6 +70,9 @@ class Measured(ReadOnly):
         Which exposure has light that varied between its frames, and by how much; empty if none has.
     colours : Colours or None
         Colour filters of the pixels, where they are given.
+    filters : Filters or None
+        Colour filters of the pixels with their responses, where they are given or stand out of the
+        values; None until they are looked for.
     names : tuple of str
         What the user calls each exposure, if anything.
     """
@@ -86,6 +89,7 @@ class Measured(ReadOnly):
     raw: bool = False
     unsteady: str = ""
     colours: Colours | None = None
+    filters: Filters | None = None
     names: tuple[str, ...] = ()
 
     def __len__(self) -> int:
@@ -97,6 +101,11 @@ class Measured(ReadOnly):
         """Sizes of the sensor (rows, cols)."""
         rows, cols = self.values.shape[1:]
         return rows, cols
+
+    @property
+    def cfa(self) -> Colours | None:
+        """The colour filters that were given."""
+        return self.filters.colours if self.filters is not None and self.filters.given else None
 
     def usable(self, exposure: int | slice = slice(None)) -> Bools:
         """Return which measurements may be used, of all exposures or of one."""

@@ -238,9 +238,12 @@ def _dtype(frames: object) -> np.dtype[Any] | None:
 
 def saturated_values(values: Array, levels: Sequence[float | None], words: Words) -> Bools | None:
     """Which values of frames (n, rows, cols) reach the level of their frame; None if none does."""
+    known = [(k, level) for k, level in enumerate(levels) if level is not None]
+    reached = [(k, level) for k, level in known if np.fmax.reduce(values[k], axis=None) >= level]
+    if not reached:
+        return None  # usually: then no map of all values is made
     saturated = np.zeros(values.shape, bool)
-    for k, level in enumerate(levels):
-        if level is not None:
-            saturated[k] = values[k] >= level
-            refuse_saturated(words.place(k), values[k], saturated[k], level)
-    return saturated if saturated.any() else None
+    for k, level in reached:
+        saturated[k] = values[k] >= level
+        refuse_saturated(words.place(k), values[k], saturated[k], level)
+    return saturated

@@ -17,7 +17,7 @@ from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.curves import horner_inverse, least_slope
 from equipix.nuc.level_rules import CURVES, INVERSE, Curves, inverse_error
 from equipix.nuc.levels import Levels, alike_pixels, levels_of
-from equipix.nuc.order import check_count, check_gain, check_order, chosen_order, form_of
+from equipix.nuc.order import check_count, check_gain, check_order, chosen_order
 from equipix.nuc.response import Response, common_misfit
 
 _MOST_MOVED = 0.01
@@ -146,7 +146,6 @@ def fitted(
     The other parameters and the errors are those of `fit`.
     """
     started = datetime.now(UTC)
-    check_order(order, by)
     workers = positive_workers(workers)
     with naming_memory("fitting response curves"):
         options: dict[str, Any] = {"order": order, "by": by}
@@ -177,10 +176,10 @@ def fitted(
 
 def _parts(levels: Levels) -> list[tuple[Bools, Levels]]:
     """The levels of each colour, with a map of its pixels; all of them without colours."""
-    everywhere = np.ones(levels.good.shape, bool)
-    if levels.cfa is None:
+    everywhere = np.ones(levels.shape, bool)
+    if levels.colours is None:
         return [(everywhere, levels)]
-    planes = [plane for _, plane in levels.cfa.planes(everywhere.shape)]
+    planes = [plane for _, plane in levels.colours.planes(everywhere.shape)]
     return [(plane, levels.of_pixels(plane)) for plane in planes if levels.good[plane].any()]
 
 
@@ -191,9 +190,8 @@ def _joined(parts: list[tuple[Bools, dict[str, Array]]]) -> dict[str, Array]:
     """
     if len(parts) == 1 and parts[0][0].all():
         return parts[0][1]
-    counts, means = zip(
-        *((pixels.sum(), maps.pop("levels")) for pixels, maps in parts), strict=True
-    )
+    counts = [pixels.sum() for pixels, _ in parts]
+    means = [maps.pop("levels") for _, maps in parts]
     joined: dict[str, Array] = {"levels": np.average(means, axis=0, weights=counts)}
     shape = parts[0][0].shape
     for name, first in parts[0][1].items():
@@ -206,11 +204,11 @@ def _joined(parts: list[tuple[Bools, dict[str, Array]]]) -> dict[str, Array]:
 
 def _curves(levels: Levels, order: int, by: By, workers: int | None) -> dict[str, Array]:
     """Fit one order and invert it: maps and levels of a `Response`, and where curves rise."""
-    found = levels.fit(form_of(order, by), workers=workers)
+    found = levels.fit(order, by, workers=workers)
     spare = len(levels) - (order + 1)
     cleaned = _of_alike_pixels(levels, found[2], spare) if order > 0 and spare > 0 else None
     if cleaned is not None:
-        levels, found = cleaned, cleaned.fit(form_of(order, by), workers=workers)
+        levels, found = cleaned, cleaned.fit(order, by, workers=workers)
     deviation, variances, misfit, used = found
     freedom = used.astype(np.int64) - (order + 1)
     chi2 = np.where(freedom > 0, misfit / np.maximum(freedom, 1), np.nan)
@@ -247,8 +245,8 @@ def _response(levels: Levels, maps: dict[str, Array], metadata: dict[str, Any]) 
         saturation=levels.saturation,
         metadata=metadata | {"finished": finished},
         findings=levels.findings,
-        cfa=levels.cfa,
-        colour_response=levels.filters.response if levels.cfa and levels.filters else None,
+        cfa=levels.colours,
+        colour_response=levels.filters.response if levels.colours and levels.filters else None,
     )
 
 
@@ -263,7 +261,7 @@ def _of_alike_pixels(levels: Levels, misfit: Floats, freedom: int) -> Levels | N
     alike = alike_pixels(squares)
     if alike.all():
         return None
-    cleaned = levels.judged_without(~alike)
+    cleaned = levels.counting(alike)
     typical = np.median(squares) / (freedom * median_of_noise(np.array(freedom)))
     noise = levels.variances if levels.level_noise else typical
     moved = (cleaned.references - levels.references) ** 2
@@ -292,7 +290,7 @@ def _with_dark(variances: Floats, levels: Levels, by: By) -> Floats:
 
 def _flags(deviation: Floats, levels: Levels, rising: Array) -> Array:
     """Bits of `equipix.Flag` of each pixel."""
-    flags = np.zeros(levels.good.shape, np.uint32)
+    flags = np.zeros(levels.shape, np.uint32)
     bad_pixels, undetermined = levels.bad_pixels, np.isnan(deviation[0])
     for finding, pixels in vars(bad_pixels).items():
         set_bits(flags, finding, pixels)

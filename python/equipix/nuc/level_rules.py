@@ -52,7 +52,12 @@ def _on_saturation(given: Given) -> str | None:
     crowded = [level for level, share in enumerate(shares) if share > _MOST_AT_HIGHEST]
     found = measured.clipped
     if crowded and (is_of_bits(top) or _others_differ(measured, crowded)):
-        _refuse_whole(top, shares, crowded)
+        full = [level for level in crowded if shares[level] >= _WHOLE]
+        if full:
+            raise InputError(
+                f"'levels': {_named(shares, full)} are exactly {top:.10g}, the highest value, so "
+                "they saturate: leave such levels out, or expose less"
+            )
         values = round(sum(shares) * measured.values[0].size)
         found = found or Clipping(top, values)
     if found is None:
@@ -64,7 +69,7 @@ def _on_saturation(given: Given) -> str | None:
 
 def _at_highest(measured: Measured) -> tuple[float, list[float]]:
     """Highest finite raw value of all levels, and the share of each level's pixels there."""
-    tops = [_highest(measured.raw_values(level)) for level in range(len(measured.values))]
+    tops = [_highest(measured.raw_values(level)) for level in range(len(measured))]
     top = max(tops)
     if not np.isfinite(top) or top <= 0 or measured.values[0].size < _FEWEST_JUDGED:
         return top, [0.0] * len(tops)
@@ -89,22 +94,12 @@ def _share(raw: Array, least: float) -> float:
 
 def _others_differ(measured: Measured, crowded: Sequence[int]) -> bool:
     """Whether another level has most of its pixels below its highest value."""
-    for level in set(range(len(measured.values))) - set(crowded):
+    for level in set(range(len(measured))) - set(crowded):
         raw = measured.raw_values(level)
         top = _highest(raw)
         if np.isfinite(top) and _share(raw, top - ROUNDING * abs(top)) <= _MOST_AT_HIGHEST:
             return True
     return False
-
-
-def _refuse_whole(top: float, shares: Sequence[float], crowded: Sequence[int]) -> None:
-    """Refuse levels that saturate in nearly all pixels."""
-    whole = [level for level in crowded if shares[level] >= _WHOLE]
-    if whole:
-        raise InputError(
-            f"'levels': {_named(shares, whole)} are exactly {top:.10g}, the highest value, so they "
-            "saturate: leave such levels out, or expose less"
-        )
 
 
 def _named(shares: Sequence[float], levels: Sequence[int]) -> str:
@@ -189,11 +184,8 @@ def _scatter(averaged: Averaged, level: int, used: Bools, lowest: Array) -> _Sca
     rise = averaged.values[level][used].astype(np.float64) - lowest
     kept = inliers(variances, scatter_limit(frames))
     common = _common(variances[kept], rise[kept], frames - 1)
-    mean, variance = (
-        float(averaged.raw_values(level)[used].mean()),
-        float(variances[kept].mean()),
-    )
-    return _Scatter(level, mean, variance, variance - common)
+    mean, variance = averaged.raw_values(level)[used].mean(), float(variances[kept].mean())
+    return _Scatter(level, float(mean), variance, variance - common)
 
 
 def _common(variances: Array, rise: Array, freedom: int) -> float:
@@ -209,17 +201,12 @@ def _common(variances: Array, rise: Array, freedom: int) -> float:
     """
     square = float(variances.mean()) ** 2
     error = SIGMAS * float(np.sqrt((2 + 12 / freedom) / variances.size))
-    scatter = float(variances.var()) - _by_rise(variances, rise)
+    scatter, steepness = float(variances.var()), float(rise.var())
+    if steepness > 0:  # not the lowest level itself
+        # The line of the variances over the rise explains a part of it.
+        covariance = float(np.mean((rise - rise.mean()) * (variances - variances.mean())))
+        scatter -= covariance**2 / steepness
     return float(np.sqrt(max(0.0, square * (1 + error) - freedom / 2 * scatter)))
-
-
-def _by_rise(variances: Array, rise: Array) -> float:
-    """Part of the scatter of variances that their line over the rise explains."""
-    steepness = float(rise.var())
-    if steepness == 0:  # the lowest level itself
-        return 0.0
-    covariance = float(np.mean((rise - rise.mean()) * (variances - variances.mean())))
-    return covariance**2 / steepness
 
 
 def _words(full: list[_Scatter], first: _Scatter, darker: _Scatter) -> str:

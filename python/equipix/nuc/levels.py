@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from equipix import _native
-from equipix._check import Array, Bools, Floats, Words, as_mask, union
+from equipix._check import Array, Bools, By, Floats, Ints, Words, as_mask, union
 from equipix.errors import InputError
 from equipix.findings import Finding, Rule, ask, say
 from equipix.measured.colour import Colours, Filters
@@ -21,6 +21,9 @@ from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.level_rules import GIVEN, Given
 
 _LEVELS = Words("'levels'", "level")
+
+_FORMS = {1: "line", 2: "quadratic", 3: "cubic"}
+"""Form that the core fits for each order above 0; that of order 0 is named by what is corrected."""
 
 FEWEST_VALID = 0.5
 """Least share of the pixels that must have a value at every level."""
@@ -59,8 +62,6 @@ class Levels(Measured):
     frame_noise : float or None
         Noise of one frame at the lowest level, in DN, where averages give it, else that of a value
         given; None if it is unknown.
-    filters : Filters or None
-        Colour filters of the pixels, where they are given or stand out of the levels.
     findings : tuple of Finding
         What limits them.
     """
@@ -69,13 +70,7 @@ class Levels(Measured):
     good: Bools
     level_noise: tuple[LevelNoise, ...] | None
     frame_noise: float | None = None
-    filters: Filters | None = None
     findings: tuple[Finding, ...] = ()
-
-    @property
-    def cfa(self) -> Colours | None:
-        """The colour filters that were given."""
-        return self.filters.colours if self.filters is not None and self.filters.given else None
 
     def of_pixels(self, pixels: Bools) -> Self:
         """Return the levels of some pixels as one row of them, with references of their own."""
@@ -93,6 +88,7 @@ class Levels(Measured):
             bad_pixels=BadPixels(dead=chosen(self.bad_pixels.dead)),
             dark=chosen(self.dark),
             dark_variance=chosen(self.dark_variance),
+            colours=None,
             filters=None,
         )
 
@@ -104,7 +100,7 @@ class Levels(Measured):
         pairs = zip(self.level_noise, self.references, strict=True)
         return np.array([float(noise.variance(reference)) for noise, reference in pairs])
 
-    def chosen(self, exposures: NDArray[np.int64]) -> Self:
+    def chosen(self, exposures: Ints) -> Self:
         """Return some of the levels, with their references."""
         noise = self.level_noise
         return dataclasses.replace(
@@ -113,10 +109,10 @@ class Levels(Measured):
             level_noise=None if noise is None else tuple(noise[level] for level in exposures),
         )
 
-    def judged_without(self, odd: Bools) -> Self:
-        """Return the levels with references from which some of the good pixels are left out."""
+    def counting(self, alike: Bools) -> Self:
+        """Return the levels with references of those of the good pixels that are alike."""
         good = self.good.copy()
-        good[self.good] = ~odd
+        good[self.good] = alike
         return dataclasses.replace(self, good=good, references=_references(self.values, good))
 
     def limits(self) -> Floats:
@@ -146,12 +142,14 @@ class Levels(Measured):
                 count, last = count + 1, level
         return count
 
-    def fit(self, form: str, *, workers: int | None) -> tuple[Floats, Floats, Floats, Array]:
-        """Fit polynomials of a form: coefficients, variances, misfit, levels used."""
+    def fit(
+        self, order: int, by: By, *, workers: int | None
+    ) -> tuple[Floats, Floats, Floats, Array]:
+        """Fit polynomials of an order: coefficients, variances, misfit, levels used."""
         return _native.fit_response(
             self.values,
             self.references.tolist(),
-            form=form,
+            form=_FORMS.get(order, by),
             noise=self.level_noise,
             workers=workers,
         )
@@ -184,22 +182,20 @@ def levels_of(
     bad_pixels = _with_odd_responses(values, noise, measured.bad_pixels, filters)
     good = _good(values, bad_pixels, given)
     references = _references(values, good)
-    frame_noise = _frame_noise(averaged if variance is None else None, noise, references)
-    found = {
+    own = {
         "values": values,
         "bad_pixels": bad_pixels,
+        "filters": filters,
         "mask": None,
         "variance": None,
-        "noise": (),
+        "noise": (),  # in values and level_noise
+        "raw": measured.raw and averaged is not None,
+        "references": references,
+        "good": good,
+        "level_noise": noise,
+        "frame_noise": _frame_noise(averaged if variance is None else None, noise, references),
     }
-    checked = Levels(
-        **vars(measured) | found | {"raw": measured.raw and averaged is not None},
-        references=references,
-        good=good,
-        level_noise=noise,
-        frame_noise=frame_noise,
-        filters=filters,
-    )
+    checked = Levels(**vars(measured) | own)
     return dataclasses.replace(checked, findings=said + say(*ask(_CHECKED, checked)))
 
 

@@ -9,9 +9,6 @@ from equipix.errors import InputError
 from equipix.nuc.curves import response_at
 from equipix.nuc.levels import Levels, alike_pixels
 
-FORMS = {1: "line", 2: "quadratic", 3: "cubic"}
-"""Name of the form of each order above 0, whose form is named by what is corrected."""
-
 HELD = 4
 """Most levels that are held out to choose an order."""
 
@@ -20,11 +17,6 @@ _BETTER = 1e-3
 
 _ROUNDING = 1e-9
 """Prediction error of exact data, relative to the largest level."""
-
-
-def form_of(order: int, by: By) -> str:
-    """Name of the form that the core fits."""
-    return FORMS.get(order, by)
 
 
 def check_order(order: object, by: object) -> None:
@@ -94,7 +86,7 @@ def chosen_order(levels: Levels, by: By, *, workers: int | None) -> tuple[int, l
     squares = np.stack([_squares(levels, held, order, by, workers) for order in orders])
     alike = alike_pixels(squares)
     if not alike.all():
-        levels = levels.judged_without(~alike)
+        levels = levels.counting(alike)
         squares = np.stack([_squares(levels, held, order, by, workers) for order in orders])
         alike = alike_pixels(squares)
     errors = squares[:, alike].mean(axis=1).tolist()
@@ -107,7 +99,7 @@ def _squares(levels: Levels, held: Array, order: int, by: By, workers: int | Non
     total = np.zeros(int(levels.good.sum()))
     for each in held:
         others = levels.chosen(np.delete(np.arange(len(levels)), each))
-        deviation, *_ = others.fit(form_of(order, by), workers=workers)
+        deviation, *_ = others.fit(order, by, workers=workers)
         error = levels.values[each] - response_at(deviation, levels.references[each])
         total += error[levels.good] ** 2 / levels.variances[each]
     return total / len(held)

@@ -306,7 +306,8 @@ class SceneCorrection(Shown):
         said = say(*ask(_RULES, learned))
         coefficients = np.stack([low * (1 - gain) + (high - low) * offset, gain])
         # The mean of the offsets is 0, so that of raw frames stays.
-        return Polynomial(coefficients, flags, metadata, self.saturation, True, said)
+        # No saturation: bits would follow from it, and frames that `update` takes be refused.
+        return Polynomial(coefficients, flags, metadata, leaves_offset=True, findings=said)
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Write the state to a file, from which `equipix.load` goes on with the same bytes.

@@ -88,7 +88,7 @@ def run_sequence(
 
     Returns
     -------
-    Sequence
+    SequenceResult
         Number of frames, and quality over time.
 
     Raises

@@ -10,6 +10,9 @@ from equipix.exposures.positions import whole_moves
 from equipix.metrics.maps import rms_at_both_scales
 from equipix.simulate.beams import Beam, exposures
 
+_TOLERANCE = 1e-5
+"""Norm of the residual at which a solution is taken, relative to that at the start."""
+
 
 def noise_prediction(
     sensitivity: ArrayLike,
@@ -143,7 +146,7 @@ class ReducedSystem:
         on_pixels: Floats = drawn.sum(axis=0)
         return on_pixels - self._eliminated(self._scatter(drawn))
 
-    def solve(self, rhs: Floats, *, tolerance: float = 1e-5) -> Floats:
+    def solve(self, rhs: Floats) -> Floats:
         """Solve S·g = rhs by conjugate gradients, preconditioned by D_M."""
         used = self._on_pixels > 0
         solution = np.zeros_like(rhs)
@@ -154,7 +157,7 @@ class ReducedSystem:
             scaled = np.divide(residual, self._on_pixels, where=used, out=np.zeros_like(rhs))
             previous, energy = energy, float(np.sum(residual * scaled))
             first = first or energy
-            if energy <= tolerance**2 * first:
+            if energy <= _TOLERANCE**2 * first:
                 return solution
             direction = scaled + (energy / previous if previous else 0.0) * direction
             image = self.product(direction)

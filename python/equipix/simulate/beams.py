@@ -9,7 +9,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from equipix._check import ArrayLike, Floats, Rng, as_array, as_shifts
+from equipix._check import ArrayLike, Floats, Rng, as_array, as_shifts, per_exposure
 from equipix.errors import InputError
 from equipix.measured.colour import Colours
 
@@ -317,13 +317,9 @@ def exposures(
     """
     response = as_array("sensitivity", sensitivity, ndim=2)
     positions = as_shifts(shifts)
-    n = len(positions)
-    powers = np.ones(n) if flux is None else as_array("flux", flux, ndim=1)
-    turns = np.zeros(n) if rotation is None else as_array("rotation", rotation, ndim=1)
-    for name, values in (("flux", powers), ("rotation", turns)):
-        if len(values) != n:
-            raise InputError(f"'{name}' has {len(values)} values, expected {n}, one per shift")
-    frames = np.empty((n, *response.shape))
+    powers = per_exposure("flux", flux, len(positions), default=1)
+    turns = per_exposure("rotation", rotation, len(positions), default=0)
+    frames = np.empty((len(positions), *response.shape))
     for frame, power, shift, turn in zip(frames, powers, positions, turns, strict=True):
         np.multiply(power * window(beam, response.shape, shift, turn), response, out=frame)
     return frames

@@ -1,22 +1,22 @@
-"""A virtual calibration experiment: a camera on a stage in a steady beam, and a hole."""
+"""A virtual calibration experiment: a camera on a stage in a steady beam, a hole, and files."""
 
+import json
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from equipix._check import Array, ArrayLike, Floats, Progress, Rng, as_array, as_shifts
-from equipix.errors import InputError
-from equipix.io.paths import as_path
+from equipix.errors import FileError, InputError
+from equipix.io.paths import as_path, folder_beside, replace_folder
+from equipix.io.tiff import write_frames
 from equipix.measured.colour import Colours
 from equipix.measured.noise import UNIFORM, scatter, unaveraged
 from equipix.simulate.accuracy import noise_prediction
 from equipix.simulate.beams import Beam, filtered, window
 from equipix.simulate.camera import Camera, Pixels
-from equipix.simulate.recording import Stream, write_experiment
 
 FULL_SCALE_E = 20_000.0
 """Electrons that fill the range of the ADC where no gain is given."""
@@ -194,23 +194,74 @@ class VirtualExperiment:
         InputError
             If `folder` is not the name of a folder.
         """
-        camera, hole = self.camera, self.aperture_count
-        streams: dict[str, Stream] = {"dark/dark.tif": (self.dark, self.dark_count)}
+        target = as_path("folder", folder)
+        if target.exists() and not _may_replace(target, force):
+            raise FileError(
+                f"'{target}' exists and is not empty: name another folder, or force the "
+                "replacement of a folder that holds nothing but an experiment written before"
+            )
+        moves = len(self.positions) - 1
+        total = self.dark_count + (moves + 1) * self.count + 2 * moves * self.aperture_count
+        done = 0
+
+        def reported(frames: Iterator[Array]) -> Iterator[Array]:
+            nonlocal done
+            for frame in frames:
+                yield frame
+                done += 1
+                if progress is not None:
+                    progress(done, total, "writing")
+
+        size = self.camera.response.size * (1 if self.camera.bit_depth == 8 else 2)
+        with folder_beside(target) as made:
+            for name, frames, count in self._streams():
+                (made / name).parent.mkdir(exist_ok=True)
+                write_frames(made / name, reported(frames), nbytes=count * size)
+            np.savez(made / "truth.npz", **vars(self.truth))
+            (made / "experiment.toml").write_text(self._manifest(), encoding="utf-8")
+            replace_folder(target, made)
+        return target / "experiment.toml"
+
+    def _streams(self) -> Iterator[tuple[str, Iterator[Array], int]]:
+        """Name of each file, its frames, made when they are asked for, and their number."""
+        yield "dark/dark.tif", self.dark(), self.dark_count
         for k in range(len(self.positions)):
-            streams[f"frames/p{k}.tif"] = partial(self.frames, k), self.count
+            yield f"frames/p{k}.tif", self.frames(k), self.count
         for k in range(1, len(self.positions)):
-            streams[f"aperture/p{k}-before.tif"] = partial(self.aperture_before, k), hole
-            streams[f"aperture/p{k}-after.tif"] = partial(self.aperture_after, k), hole
+            yield f"aperture/p{k}-before.tif", self.aperture_before(k), self.aperture_count
+            yield f"aperture/p{k}-after.tif", self.aperture_after(k), self.aperture_count
+
+    def _manifest(self) -> str:
         cfa = None if self.cfa is None else self.cfa.written
-        return write_experiment(
-            as_path("folder", folder),
-            streams,
-            frame_bytes=camera.response.size * (1 if camera.bit_depth == 8 else 2),
-            sensor={"name": "virtual", "bit_depth": camera.bit_depth, "cfa": cfa},
-            truth=vars(self.truth),
-            force=force,
-            progress=progress,
-        )
+        sensor = {"name": "virtual", "bit_depth": self.camera.bit_depth, "cfa": cfa}
+        lines = [
+            "# calibration experiment of a virtual camera; the truth is in truth.npz",
+            "[sensor]",
+            *(f"{key} = {json.dumps(value)}" for key, value in sensor.items() if value is not None),
+            *("", "[dark]", 'frames = "dark/dark.tif"'),
+        ]
+        for k in range(len(self.positions)):
+            lines += ["", "[[exposure]]", f'name = "p{k}"', f'frames = "frames/p{k}.tif"']
+            if k:
+                ends = ("before", "after")
+                lines += [f'aperture_{end} = "aperture/p{k}-{end}.tif"' for end in ends]
+        return "\n".join(lines) + "\n"
+
+
+def _may_replace(target: Path, force: bool) -> bool:
+    """Whether the target is an empty folder, or an experiment that may be replaced."""
+    if not target.is_dir():
+        return False
+    return not any(target.iterdir()) or (force and all(map(_is_ours, target.iterdir())))
+
+
+def _is_ours(entry: Path) -> bool:
+    """Whether an entry of an experiment's folder is one that `VirtualExperiment.write` makes."""
+    if entry.is_symlink():
+        return False
+    if entry.name in ("frames", "dark", "aperture") and entry.is_dir():
+        return all(file.suffix == ".tif" and file.is_file() for file in entry.iterdir())
+    return entry.name in ("experiment.toml", "truth.npz") and entry.is_file()
 
 
 def experiment(

@@ -179,11 +179,8 @@ class StaringArray(PixelArray):
         bits = causes.get("bit_depth", self.bit_depth)
         check_bit_depth(bits)
         finer = 2.0 ** (bits - self.bit_depth)
-        scaled = {
-            name: finer * np.asarray(getattr(self, name))
-            for name in ("offset_dn", "drift_dn")
-            if finer != 1
-        }
+        names = ("offset_dn", "drift_dn") if finer != 1 else ()
+        scaled = {name: finer * np.asarray(getattr(self, name)) for name in names}
         return replace(self, **scaled | causes)
 
     @property

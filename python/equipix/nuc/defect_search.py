@@ -79,7 +79,7 @@ def of_frames(
     frames: ArrayLike | FrameStatistics,
     good: Bools,
     limits: DefectLimits,
-    cfa: Colours | None = None,
+    cfa: Colours | None,
 ) -> tuple[dict[str, Bools], tuple[Finding, ...]]:
     """Bad pixels by their noise, and what limits it; `good` are those whose curves are usable."""
     slow, light = None, Light()
@@ -282,7 +282,10 @@ def find_defects(
     with naming_memory("finding bad pixels"):
         misfit = common_misfit(response)
         slope = mean_slope(response)
-        colours, filters = _filters(response, named_cfa(response, cfa), slope)
+        given = named_cfa(response, cfa)
+        # Slopes of a response with filters are over the mean of a colour.
+        filters = Filters.of(given, slope) if response.cfa is None else None
+        colours = response.cfa if filters is None else filters.colours
         said: tuple[Finding, ...] = ()
         if filters is not None and filters.words:
             said = say(Finding("cfa", filters.words, "misfit"))
@@ -303,13 +306,3 @@ def find_defects(
     named = {f"{name:g}": float(each) for name, each in zip(PERCENTILES, percentiles, strict=True)}
     said += say(*ask(CURVES, Curves(response, misfit)))
     return Defects(flags, counts, named, misfit, limits, few, said)
-
-
-def _filters(
-    response: Response, given: Colours | None, slope: Floats
-) -> tuple[Colours | None, Filters | None]:
-    """Colours of the pixels, and filters of slopes that are not over the mean of a colour."""
-    if response.cfa is not None:
-        return response.cfa, None
-    filters = Filters.of(given, slope)
-    return (None, None) if filters is None else (filters.colours, filters)
