@@ -25,6 +25,9 @@ _SHARES = (0.1, 99.9)
 
 _MOST_BINS = 256
 
+_ENOUGH = 2**24
+"""Pixels of a map whose lines tell medians, quartiles and spectra of all."""
+
 _MOST_MARKS = 20_000
 """Most flagged pixels of a kind that are marked one by one: more look like an area."""
 
@@ -140,20 +143,20 @@ def draw_histogram(axes: Axes, shown: Map) -> None:
 
     As in EMVA 1288, release 4.0, section 8.4: single pixels far out show on a logarithmic scale.
     """
-    known = shown.values[np.isfinite(shown.values)].astype(np.float64)
-    low, high = float(known.min()), float(known.max())
+    low, high = shown.extremes
     if high <= low:
         low, high = low - 0.5, high + 0.5
     # Rice's rule: the bins of few pixels are wide.
-    bins = min(_MOST_BINS, round(2 * np.cbrt(known.size)))
-    counts, edges = np.histogram(known, bins, (low, high))
+    count = int(np.isfinite(shown.values).sum())
+    bins = min(_MOST_BINS, round(2 * np.cbrt(count)))
+    counts, edges = np.histogram(shown.values, bins, (low, high))
     axes.stairs(counts, edges, fill=True, alpha=0.6)
-    middle, quarter, three = np.percentile(known, (50, 25, 75))
+    middle, quarter, three = np.nanpercentile(_some(shown.values, 0), (50, 25, 75))
     spread = (three - quarter) / 1.349
     if spread > 0:
         at = np.linspace(low, high, 4 * _MOST_BINS)
         normal = np.exp(-0.5 * ((at - middle) / spread) ** 2) / (spread * np.sqrt(2 * np.pi))
-        axes.plot(at, normal * known.size * (edges[1] - edges[0]), color="black", linewidth=0.8)
+        axes.plot(at, normal * count * (edges[1] - edges[0]), color="black", linewidth=0.8)
     axes.set(
         title=f"Histogram of {shown.name[0].lower()}{shown.name[1:]}",
         xlabel=f"{shown.unit or 'relative'}; line: normal, by the quartiles",
@@ -163,10 +166,16 @@ def draw_histogram(axes: Axes, shown: Map) -> None:
     )
 
 
+def _some(values: Array, axis: int) -> Array:
+    """Even choice of lines of a large map: rows for axis 0, columns for axis 1."""
+    step = -(-values.size // _ENOUGH)
+    return values[::step] if axis == 0 else values[:, ::step]
+
+
 def draw_profiles(axes: Axes, shown: Map) -> None:
     """Draw the medians of rows and of columns, which show stripes and slopes."""
     for axis, name in ((1, "of each row"), (0, "of each column")):
-        axes.plot(nanmedian(shown.values, axis=axis), linewidth=0.8, label=name)
+        axes.plot(nanmedian(_some(shown.values, axis), axis=axis), linewidth=0.8, label=name)
     axes.set(title=f"Medians: {shown.title}", xlabel="row, column")
     axes.legend(fontsize="small")
 
@@ -193,10 +202,10 @@ def draw_spectrum(axes: Axes, shown: Map) -> None:
     root of the number of pixels along them, as in the spectrograms of EMVA 1288, release 4.0,
     section 8.2. Pixels without a value count as the mean.
     """
-    values = shown.values.astype(np.float64)
-    values = np.nan_to_num(values - np.nanmean(values))
     positive = False
     for axis, name in ((1, "along rows"), (0, "along columns")):
+        values = _some(shown.values, 1 - axis).astype(np.float64)
+        values = np.nan_to_num(values - np.nanmean(values))
         power = np.abs(np.fft.rfft(values, axis=axis)) ** 2
         size = values.shape[axis]
         line = np.sqrt(power.mean(axis=1 - axis) / size)
