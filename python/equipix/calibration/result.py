@@ -132,6 +132,10 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
         unpickled.
     findings : tuple of Finding
         What limits the result: `calibrate` has warned of each.
+    residual_map : ndarray, shape (rows of cells, columns of cells), float32, or None
+        Rms of the residuals over all exposures, in standard deviations of a value, or in DN where
+        no variance was known; NaN where none was used. Cells are square, the fewest pixels that
+        make at most about 260 000 residuals, which one of their rows represents.
     rejected : ndarray of bool, shape (n, rows, cols), or None
         The measurements that a robust calibration left out; `metadata` counts them.
     shift_sign : {"confirmed", "contradicted", "undetermined"}
@@ -176,6 +180,7 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
     tilt_std: Pair | None = None
     shift_std: Places | None = None
     weighted: Weighted | None = field(default=None, metadata=UNSAVED)
+    residual_map: Annotated[Array, "float32", "cell_rows cell_cols"] | None = None
     rejected: Annotated[Bools, "bool", "exposures rows cols"] | None = None
     shift_sign: ShiftSign = "undetermined"
     orientation: OrientationTest | None = None
@@ -244,6 +249,7 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
             tilt_std=None if bars is None else bars.tilt,
             shift_std=None if bars is None else bars.shifts,
             weighted=weighted,
+            residual_map=evidence.residual_map,
             rejected=weighted.rejected,
             shift_sign=orientation.sign,
             orientation=orientation,

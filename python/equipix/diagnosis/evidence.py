@@ -14,7 +14,7 @@ from equipix.exposures.exposures import Exposures
 from equipix.exposures.flux import Flux
 from equipix.fitting.error_bars import DarkStd, ErrorBars, standard_deviations
 from equipix.fitting.pixels import pixel_flags
-from equipix.fitting.residuals import Residuals, sampled
+from equipix.fitting.residuals import Residuals, rms_map, sampled
 from equipix.fitting.weighted import Options, Weighted, sampled_arrays
 
 
@@ -32,6 +32,8 @@ class Evidence:
         Bits of `equipix.Flag`.
     residuals : Residuals
         A sample of the residuals.
+    residual_map : ndarray
+        Their rms in cells of pixels.
     orientation : OrientationTest
         Which orientation of the shifts the data confirm.
     drift : Drift or None
@@ -50,6 +52,7 @@ class Evidence:
     options: Options
     flags: Array
     residuals: Residuals
+    residual_map: Array
     orientation: OrientationTest
     drift: Drift | None
     misfit: Misfit | None
@@ -73,7 +76,8 @@ class Evidence:
         if found is not None:
             weighted = weighted._replace(excess=found.excess)
         orientation = orientation.among_fluxes(contradicted=contradicted)
-        return cls(weighted, options, flags, residuals, orientation, drift, found, colours)
+        seen = (residuals, rms_map(weighted, options.fit.workers))
+        return cls(weighted, options, flags, *seen, orientation, drift, found, colours)
 
     @property
     def exposures(self) -> Exposures:

@@ -24,7 +24,7 @@ EXACT = 0.3
 """Largest `Residuals.inexactness` at which F is as good as at its minimum."""
 
 SAMPLED = 2**18
-"""Measurements of a sample: a correlation of 1.2 % is then five standard errors."""
+"""Measurements of a sample, and of a map: a correlation of 1.2 % is then five standard errors."""
 
 _BAND = 32
 """Rows of a band: several blocks of neighbours, and more than most shifts."""
@@ -95,10 +95,41 @@ def _slope(light: Floats, axis: int) -> Floats:
 
 def sampled(weighted: Weighted, most: int = SAMPLED, workers: int | None = None) -> Residuals:
     """Residuals of a fit, of at most about so many measurements."""
+    exposures, testing = weighted.exposures, tested(weighted.fit)
+    used = sum(
+        np.count_nonzero(exposures.used(weighted.fit, k) & testing, axis=1)
+        for k in range(len(exposures))
+    )
+    count = most // (len(exposures) * exposures.shape[1])
+    return _of_rows(weighted, bands(np.asarray(used), count), workers)
+
+
+def cell_side(shape: tuple[int, int], exposures: int) -> int:
+    """Pixels along the side of a cell of `rms_map`."""
+    return -(-shape[0] * shape[1] * exposures // SAMPLED)
+
+
+def rms_map(weighted: Weighted, workers: int | None = None) -> Array:
+    """Rms residual over the exposures in square cells of pixels; float32, NaN where there is none.
+
+    A cell of a large sensor is judged by one of its rows.
+    """
+    exposures = weighted.exposures
+    height, width = exposures.shape
+    side = cell_side(exposures.shape, len(exposures))
+    rows = np.arange(side // 2, max(height // side, 1) * side, side)[:, None]
+    values = _of_rows(weighted, rows, workers).values[:, :, 0]
+    inner = values[..., : max(width // side, 1) * side]
+    cells = np.square(inner).reshape(*inner.shape[:2], -1, min(side, width))
+    counts = np.isfinite(cells).sum(axis=(0, 3))
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.sqrt(np.nansum(cells, axis=(0, 3)) / counts), np.float32)
+
+
+def _of_rows(weighted: Weighted, rows: Array, workers: int | None) -> Residuals:
+    """Residuals of these rows (bands, rows of a band)."""
     exposures, fit = weighted.exposures, weighted.fit
     every, searched, testing = range(len(exposures)), in_search(fit), tested(fit)
-    used = sum(np.count_nonzero(exposures.used(fit, k) & testing, axis=1) for k in every)
-    rows = bands(np.asarray(used), most // (len(exposures) * exposures.shape[1]))
     shape = (len(exposures), *rows.shape, exposures.shape[1])
     values, light, response = np.empty(shape), np.empty(shape), np.empty(shape)
     size = (rows.shape[1], exposures.shape[1])

@@ -102,9 +102,7 @@ def draw_map(axes: Axes, shown: Map) -> None:
     image = axes.imshow(
         values, vmin=low, vmax=high, cmap=CMAPS[shown.scale], extent=extent, interpolation="none"
     )
-    means = f"means of {step}×{step} pixels; " if step > 1 else ""
-    smallest, largest = shown.extremes
-    axes.set(title=shown.title, xlabel=f"column\n{means}{smallest:.4g} to {largest:.4g}")
+    axes.set(title=shown.title, xlabel=f"column\n{shown.words(step)}")
     axes.set_ylabel("row")
     axes.figure.colorbar(image, ax=axes, shrink=0.8)
 

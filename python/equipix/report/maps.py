@@ -11,6 +11,7 @@ from equipix.bolometer.dynamic import DynamicCorrection
 from equipix.calibration.result import Calibration
 from equipix.correction.protocol import Correction
 from equipix.findings import Flag
+from equipix.fitting.residuals import cell_side
 from equipix.measured.statistics import FrameStatistics
 from equipix.metrics.maps import block_means
 from equipix.nuc.response import Response
@@ -38,12 +39,15 @@ class Map:
         The values; NaN where there is none.
     scale : {"level", "deviation", "size"}
         Whether they lie around a level of their own, around 0, or above it.
+    cell : int
+        Pixels along the side of what has a value.
     """
 
     name: str
     unit: str
     values: Array
     scale: Scale = "level"
+    cell: int = 1
 
     @property
     def title(self) -> str:
@@ -56,6 +60,14 @@ class Map:
         known = self.values[np.isfinite(self.values)]
         return (float(known.min()), float(known.max())) if known.size else (np.nan, np.nan)
 
+    def words(self, step: int) -> str:
+        """What a picture shows whose points are so many pixels wide, and the extremes."""
+        smallest, largest = self.extremes
+        points = "cells" if self.cell > 1 else "single pixels"
+        means = f"means of {step}×{step} pixels; " if step > self.cell else ""
+        cells = f"cells of {step}×{step} pixels, " if step == self.cell > 1 else f"{points} "
+        return f"{means}{cells}from {smallest:.4g} to {largest:.4g} {self.unit}".strip()
+
     def reduced(self, largest: int = LARGEST) -> tuple[Floats, int]:
         """Block means of at most so many rows and columns, and the pixels along a block."""
         step = -(-max(self.values.shape) // largest)
@@ -63,7 +75,7 @@ class Map:
         parts = [self.values[first : first + rows] for first in range(0, len(self.values), rows)]
         # A part below one block, of the last rows, is left out like columns at the edge.
         means = [block_means(part, step) for part in parts if len(part) >= step]
-        return np.concatenate(means), step
+        return np.concatenate(means), step * self.cell
 
 
 def maps_of(result: Any) -> list[Map]:
@@ -89,6 +101,11 @@ def _of_calibration(calibration: Calibration) -> Iterator[Map]:
     yield Map("Sensitivity M", "", calibration.sensitivity)
     if calibration.sensitivity_std is not None:
         yield Map("Standard deviation of M", "", calibration.sensitivity_std, "size")
+    residuals = calibration.residual_map
+    if residuals is not None:
+        unit = "DN" if calibration.metadata["options"]["weights"] == "equal" else "σ"
+        cell = cell_side(calibration.shape, len(calibration.shifts))
+        yield Map("Residuals, rms", unit, residuals, "size", cell)
     yield Map("Beam L", "DN", calibration.beam)
     if calibration.dark is not None:
         yield Map("Dark", "DN", calibration.dark)

@@ -146,15 +146,13 @@ def _map(shown: Map, largest: int) -> dict[str, Any]:
     """Picture, values and words of a map."""
     values, step = shown.reduced(largest)
     low, high = limits_of(shown, values)
-    smallest, biggest = shown.extremes
     known = values[np.isfinite(values)]
     ends = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
     cmap = CMAPS[shown.scale]
-    means = f"Means of {step}×{step} pixels; single" if step > 1 else "Single"
     return {
         "title": shown.name,
         "unit": shown.unit,
-        "words": f"{means} pixels from {smallest:.5g} to {biggest:.5g} {shown.unit}".strip(),
+        "words": shown.words(step),
         "rows": values.shape[0],
         "cols": values.shape[1],
         "step": step,
