@@ -123,6 +123,7 @@ def draw_flags(axes: Axes, flags: Array) -> None:
             markersize=max(3, 10 - 2 * number),  # a pixel may have several flags
             color=f"C{number}",
             label=f"{name}: {len(row)}",
+            rasterized=True,  # thousands of marks are smaller as an image
         )
     axes.set(
         title=f"Flagged pixels: {np.count_nonzero(flags)} of {flags.size}",

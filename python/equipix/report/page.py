@@ -7,7 +7,8 @@ import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,13 +19,10 @@ from equipix.errors import EquipixError
 from equipix.findings import Finding, Flag, usable
 from equipix.nuc.response import Response
 from equipix.pictures import missing_matplotlib, new_figure
-from equipix.report.drawing import CMAPS, curves_of, limits_of
+from equipix.report.drawing import CMAPS, curves_of, draw_flags, limits_of
 from equipix.report.figures import summary, words_of
 from equipix.report.limits import Check, Limits, LimitsFile, checked
 from equipix.report.maps import Map, flagged, maps_of
-
-if TYPE_CHECKING:
-    pass
 
 _LARGEST = 480
 """Most rows and columns of a map on a page of one result."""
@@ -120,9 +118,6 @@ def part_of(name: str, result: Any, limits: LimitsFile, *, share: int = 1) -> Pa
     if flags is not None:
         figures["flagged_share"] = float(np.mean(~usable(flags)))
     maps = maps_of(result)
-    if flags is not None and flags.any():
-        bad = (flags != 0).astype(np.float32)
-        maps.append(Map("Flagged pixels", "share of a cell", bad, "size"))
     return Part(
         name=name,
         what=repr(result).strip("<>"),
@@ -187,7 +182,11 @@ def _picture(values: Floats, low: float, high: float, cmap: str) -> str:
 
 def _plots(result: Any, first: Map) -> Iterator[dict[str, str]]:
     """Curves of a result as drawings that take the colour of the text around them."""
-    for draw in curves_of(result, first):
+    draws = curves_of(result, first)
+    flags = getattr(result, "flags", None)
+    if flags is not None and flags.any():
+        draws.insert(0, partial(draw_flags, flags=flags))
+    for draw in draws:
         figure = new_figure(5.2, 3.8)
         axes = figure.subplots()
         draw(axes)
