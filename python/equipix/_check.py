@@ -350,10 +350,14 @@ def as_mask(
 
 
 class Words(NamedTuple):
-    """What messages call the argument of the measurements, and one of them."""
+    """What messages call the argument of the measurements, and one of them.
+
+    `pixel_variances` is whether they take a variance of each pixel.
+    """
 
     argument: str = "'frames'"
     one: str = "exposure"
+    pixel_variances: bool = True
 
     def place(self, number: int, name: str = "") -> str:
         """Name one of the measurements."""

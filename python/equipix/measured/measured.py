@@ -274,10 +274,11 @@ def _noise_of(
     if len(shape) == 1:
         check_count("variance", len(numbers), len(values), words.one)
         return (), numbers.astype(np.float64)
-    if shape != values.shape:
+    if shape != values.shape or not words.pixel_variances:
+        others = values.shape if words.pixel_variances else "a NoiseModel"
         raise InputError(
             f"'variance' has shape {shape}, expected {(len(values),)}, one number for each "
-            f"{words.one}, or {values.shape}"
+            f"{words.one}, or {others}"
         )
     with np.errstate(over="ignore"):  # the solver refuses what becomes infinite
         return (), numbers.astype(values.dtype, copy=False)
