@@ -229,7 +229,7 @@ class TestCombine:
         assert spread[0] > 0.05
         # Noise of 1e-4 is up to 1e-3 where the source was faint, and so is the tilt that it leaves.
         assert spread[1] < 5e-3
-        assert set(both.metadata) == {"first", "then"}
+        assert set(both.metadata) == {"versions", "first", "then", "finished"}
 
     def test_a_dark_is_not_subtracted_twice(self):
         shifts = equipix.cross_pattern(5, 7)

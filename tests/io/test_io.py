@@ -482,7 +482,7 @@ def test_the_longest_name_can_be_written_by_many_at_once(tmp_path: Path) -> None
 def test_damaged_statistics_are_refused(tmp_path: Path, suffix: str) -> None:
     path, average = tmp_path / f"a{suffix}", equipix.average(WIDE)
     for changed, message in (
-        ({"version": "2"}, "of version 2, this version of equipix reads version 2: make"),
+        ({"version": "3"}, "of version 3, this version of equipix reads version 3: make"),
         ({"version": None}, "of version None"),
         ({"arrays": {"mean": average.mean.astype(np.int64)}}, "damaged: array 'mean' is int64"),
         (
@@ -532,7 +532,7 @@ def test_foreign_and_broken_files_are_refused(tmp_path: Path, suffix: str) -> No
     with pytest.raises(FileError, match="holds something, expected .* or frame statistics or .*na"):
         equipix.load(path)
     save_pages(path, PAGES, {"kind": "frame statistics", "version": 99}, force=True)
-    with pytest.raises(FileError, match=r"of version 99, .* reads version 2: .* install"):
+    with pytest.raises(FileError, match=r"of version 99, .* reads version 3: .* install"):
         equipix.load(path)
     equipix.average(WIDE).save(path, force=True)
     whole = path.read_bytes()

@@ -27,7 +27,7 @@ from equipix.diagnosis.lamp_drift import Drift
 from equipix.diagnosis.orientation import OrientationTest
 from equipix.errors import InputError
 from equipix.exposures.positions import ROUNDING, Positions, as_rotation
-from equipix.findings import Finding, determined
+from equipix.findings import Findings, determined
 from equipix.fitting.error_bars import functional_std
 from equipix.fitting.weighted import Weighted, check_unchanged
 from equipix.io.record import UNSAVED, Counts, Map, Record
@@ -179,7 +179,7 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
     shift_sign: ShiftSign = "undetermined"
     orientation: OrientationTest | None = None
     drift: Drift | None = None
-    findings: tuple[Finding, ...] = ()
+    findings: Findings = ()
     cfa: Colours | None = None
     colour_response: dict[str, float] | None = None
     takes_dark: ClassVar[bool] = True
@@ -200,12 +200,7 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
         Colours.of(self.cfa)
 
     @classmethod
-    def of(
-        cls,
-        evidence: Evidence,
-        findings: tuple[Finding, ...],
-        metadata: dict[str, Any],
-    ) -> Self:
+    def of(cls, evidence: Evidence, findings: Findings, metadata: dict[str, Any]) -> Self:
         """Make the result from a fit and what was derived from it."""
         exposures, fit, bars = evidence.exposures, evidence.fit, evidence.bars
         dtype, flags, orientation = exposures.values.dtype, evidence.flags, evidence.orientation

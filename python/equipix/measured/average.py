@@ -26,7 +26,7 @@ from equipix._check import (
 from equipix.errors import FileError, InputError, UnsupportedFileError
 from equipix.io.frames import frame_format, stream_frames
 from equipix.io.paths import find_files
-from equipix.io.record import read_record
+from equipix.io.record import made, now, read_record
 from equipix.measured.saturation import level_of
 from equipix.measured.statistics import FrameStatistics, _masked, _step, _subtract, saved_shape
 from equipix.measured.stream import Rejection, batches, sum_dtype, unmasked
@@ -113,6 +113,7 @@ def average(
     >>> result.mean, result.variance
     (array([[2., 2.]]), array([[2., 0.]]))
     """
+    started = now()
     offset = dark if isinstance(dark, FrameStatistics | None) else as_floats("dark", dark, ndim=2)
     how = _How(
         as_level(saturation),
@@ -127,7 +128,11 @@ def average(
             statistics = _average_files(taken, how)
         else:
             statistics = _average_batches(batches(taken), how, operator.length_hint(frames))
-        return _masked(_subtract(statistics, offset), as_mask(mask, statistics.mean.shape))
+        options = {"saturation": how.level, "reject": statistics.reject}
+        # A saved average brings its own.
+        metadata = statistics.metadata or made(options=options, started=started)
+        found = dataclasses.replace(_subtract(statistics, offset), metadata=metadata)
+        return _masked(found, as_mask(mask, found.mean.shape))
 
 
 class _How(NamedTuple):

@@ -14,7 +14,7 @@ with the signals of the pixels that follow the light.
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ import numpy as np
 
 from equipix._check import Array, Floats, check_maps
 from equipix.errors import InputError
-from equipix.findings import Rule
+from equipix.findings import Finding, Rule
 from equipix.io.formats import refuse_saved, saved_kind
 from equipix.io.record import Counts, Doubles, Record, read_record
 from equipix.measured.noise import scatter_limit, step_of
@@ -36,7 +36,7 @@ DARKER = 0.25
 
 
 @dataclass(frozen=True, eq=False)
-class FrameStatistics(Record, kind="frame statistics", version=2):
+class FrameStatistics(Record, kind="frame statistics", version=3):
     """Mean and scatter of repeated frames of one scene, as read-only arrays.
 
     `equipix.average`, experiment.toml and the command line take the file that `save` writes in the
@@ -72,6 +72,10 @@ class FrameStatistics(Record, kind="frame statistics", version=2):
         that of the light, and of the noise over the number of pixels. Where samples are missing it
         is that of their differences to the first values of their pixels. None of one frame, or
         where it is not known: a saved average does not show it without the pixels of another mask.
+    metadata : dict
+        Versions, options and times, as JSON values; ``equipix average`` adds the hashes of files.
+    findings : tuple of Finding
+        What limits the result, where it was asked, as ``equipix average`` does.
     """
 
     mean: Doubles
@@ -85,6 +89,8 @@ class FrameStatistics(Record, kind="frame statistics", version=2):
     reject: float | None = None
     step: float = 0.0
     light_variance: float | None = None
+    metadata: dict[str, Any] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse maps of different shapes."""

@@ -21,7 +21,7 @@ from equipix._native import SceneCorrection as Native
 from equipix.correction.polynomial import Polynomial
 from equipix.errors import InputError
 from equipix.findings import Rule, ask, say, set_bits
-from equipix.io.record import Record
+from equipix.io.record import Record, made
 from equipix.measured.defects import unresponsive
 
 DataRange = tuple[float, float]
@@ -289,24 +289,22 @@ class SceneCorrection:
         flags = np.zeros(self.shape, np.uint32)
         set_bits(flags, "out_of_range", self._mask)
         set_bits(flags, "dead", unresponsive(gain, self._native.deviation(), self.frames_taken))
-        metadata = {
-            "scene": {
-                "method": self.method,
-                "options": self.options,
-                "data_range": list(self._range),
-                "saturation": self.saturation,
-                "frames": self.frames,
-                "frames_taken": self.frames_taken,
-                "frames_foreign": self.frames_foreign,
-                "floor_dn": self.floor,
-            }
+        scene = {
+            "method": self.method,
+            "options": self.options,
+            "data_range": list(self._range),
+            "saturation": self.saturation,
+            "frames": self.frames,
+            "frames_taken": self.frames_taken,
+            "frames_foreign": self.frames_foreign,
+            "floor_dn": self.floor,
         }
         learned = _Learned(self, self._native.still(), self._seen.peak, gain[flags == 0])
         said = say(*ask(_RULES, learned))
         coefficients = np.stack([low * (1 - gain) + (high - low) * offset, gain])
         # The mean of the offsets is 0, so that of raw frames stays.
         # No saturation: bits would follow from it, and frames that `update` takes be refused.
-        return Polynomial(coefficients, flags, metadata, leaves_offset=True, findings=said)
+        return Polynomial(coefficients, flags, made(scene=scene), leaves_offset=True, findings=said)
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Write the state to a file, from which `equipix.load` goes on with the same bytes.
