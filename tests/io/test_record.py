@@ -311,7 +311,7 @@ def test_a_reader_of_one_kind_refuses_the_others(tmp_path):
     with pytest.raises(FileError, match=r"a\.tif: holds frame statistics, expected calibration th"):
         read_record(tmp_path / "a.tif", equipix.Calibration)
     with pytest.raises(
-        InputError, match=r"expected the suffix \.tif or \.npz"
+        InputError, match=r"expected the suffix \.tif, \.tiff, \.npz, \.bin, \.hex or \.h"
     ):
         equipix.load(tmp_path / "a.txt")
 

@@ -18,7 +18,7 @@ from equipix.io.formats import SUFFIXES
 from equipix.io.paths import refuse_inputs
 from equipix.io.record import read_record
 from equipix.pictures import check_picture, draw_comparison, save_figure
-from equipix.saved_results import load
+from equipix.saved_results import READ, load
 
 commands = typer.Typer()
 
@@ -73,7 +73,7 @@ def _refuse_partial(calibration: Calibration, output: Path) -> None:
 
 @commands.command(epilog="Example: equipix inspect cal.tif")
 def inspect(
-    file: Annotated[Path, typer.Argument(help="A correction or an average: .tif or .npz.")],
+    file: Annotated[Path, typer.Argument(help=f"A correction or an average: {READ}.")],
     as_json: terminal.Json = False,
 ) -> None:
     """Show what a file of a correction, or of averaged frames, holds."""

@@ -15,12 +15,9 @@ from equipix.io.formats import SUFFIXES
 from equipix.io.paths import find_files, refuse_inputs
 from equipix.measured import statistics
 from equipix.measured.average import average as average_frames
-from equipix.saved_results import load_correction
+from equipix.saved_results import READ, load_correction
 
 commands = typer.Typer()
-
-_OTHER_FORMATS = (".jpg", ".jpeg", ".bmp", ".pgm", ".fits", ".fit", ".npz", ".npy")
-"""Formats of images that `correct` does not write."""
 
 
 @commands.command(epilog="Example: equipix average frames/*.png --dark 'dark/*.png' -o mean.tif")
@@ -72,7 +69,7 @@ def average(
     "its 'histogram' with a plateau of 4 times the mean of its bins.",
 )
 def correct(
-    correction: Annotated[Path, typer.Argument(help="A calibration or a response: .tif or .npz.")],
+    correction: Annotated[Path, typer.Argument(help=f"A correction: {READ}.")],
     frames: Annotated[list[str], typer.Argument(help="Image files or globs.")],
     output: Annotated[
         Path,
@@ -113,9 +110,9 @@ def correct(
 
 
 def _refuse_image(output: Path) -> None:
-    """Refuse a folder that is named like a file of another format."""
-    if output.suffix.lower() in _OTHER_FORMATS and not output.is_dir():
+    """Refuse a new folder that is named like a file of another format."""
+    if output.suffix and is_folder(output) and not output.is_dir():
         raise InputError(
             f"'{output}' ends in '{output.suffix}', but corrected frames are written as .tif: name "
-            "a .tif file, a .png, or a folder for a .tif of each input"
+            "a .tif, a .png of one frame, or a folder (one with a dot in its name: make it first)"
         )

@@ -13,7 +13,7 @@ from equipix.findings import usable
 from equipix.hardware.quality import quality, smallest_widths
 from equipix.hardware.table import SUFFIXES, Table
 from equipix.hardware.words import STEPS
-from equipix.saved_results import load_correction
+from equipix.saved_results import READ, load_correction
 
 _SOUGHT = ("offset_bits", "gain_bits")
 """Widths of which the smallest that suffice are sought."""
@@ -40,7 +40,7 @@ commands = typer.Typer()
     linearise="Raw values in DN between which a line replaces a curved correction.",
 )
 def hardware(
-    result: Annotated[Path, typer.Argument(help="A calibration or a response: .tif or .npz.")],
+    result: Annotated[Path, typer.Argument(help=f"A correction: {READ}.")],
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Table: .bin, .hex ($readmemh) or .h (C).")
     ],

@@ -21,7 +21,7 @@ from equipix.measured.colour import Colours
 from equipix.measured.defects import DefectLimits
 from equipix.nuc.defect_search import find_defects
 from equipix.nuc.response import Response
-from equipix.saved_results import load_correction
+from equipix.saved_results import READ, load_correction
 
 commands = typer.Typer()
 
@@ -106,7 +106,7 @@ def defects(
 
 @nuc.command(epilog="Example: equipix nuc quality response.tif level/*.tif")
 def quality(
-    correction: Annotated[Path, typer.Argument(help="A response or a calibration: .tif or .npz.")],
+    correction: Annotated[Path, typer.Argument(help=f"A correction: {READ}.")],
     frames: Annotated[list[str], typer.Argument(help="Raw frames of one steady even level.")],
     confidence: Annotated[
         float, typer.Option(help="Probability of the confidence interval.")
