@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import os
 import pty
@@ -204,11 +205,25 @@ def test_average_writes_statistics(run, experiment, tmp_path):
         "--saturation", "4095", "--json",
     )  # fmt: skip
     assert status == 0
-    assert json.loads(out)["frames"] == 12
+    told = json.loads(out)
+    assert (told["frames"], told["findings"]) == (12, [])
     expected = average([frames / "p0.tif", frames / "p1.tif"], dark=average(dark), saturation=4095)
     saved = equipix.load(output)
     for name, values in expected.maps.items():
         np.testing.assert_array_equal(getattr(saved, name), values)
+    files = [str(each) for each in (frames / "p0.tif", frames / "p1.tif", dark)]
+    assert [*saved.metadata["inputs"]] == files
+    digest = hashlib.sha256(dark.read_bytes()).hexdigest()
+    assert saved.metadata["inputs"][files[-1]] == digest
+    # A saved average keeps its origin.
+    run("average", output, "-o", tmp_path / "again.tif")
+    again = equipix.load(tmp_path / "again.tif").metadata
+    assert {*again["inputs"]} == {*files, str(output)}
+    assert {name: again[name] for name in ("options", "started", "finished")} == {
+        "options": {"saturation": 4095, "reject": None},
+        "started": saved.metadata["started"],
+        "finished": saved.metadata["finished"],
+    }
 
 
 def test_correct_to_one_file_and_to_a_folder(run, experiment, calibration, tmp_path):
@@ -233,8 +248,8 @@ def test_correct_warns_of_corrected_frames(run, experiment, calibration, tmp_pat
     status, _, err = run("correct", calibration, *inputs, "-o", once)
     assert (status, err) == (0, "")
     corrected = sorted(once.iterdir()) if folder else [once]
-    status, _, err = run("correct", calibration, *corrected, "-o", twice)
-    assert status == 0
+    status, out, err = run("correct", calibration, *corrected, "-o", twice, "--json")
+    assert (status, [each["kind"] for each in json.loads(out)["findings"]]) == (0, ["corrected"])
     more = " and 1 more" if folder else ""
     assert err.startswith(f"equipix: warning: {corrected[0]}{more}: corrected already")
     assert err.count("\n") == 1
@@ -503,6 +518,13 @@ class TestPlan:
         assert found["equations"] == 5 * 64 * 80
         assert sorted(found["order"]) == [0, 1, 2, 3, 4]
 
+    def test_an_option_without_effect_is_a_finding(self, run):
+        command = ("plan", "--shape", 64, 80, "--shifts", self.CROSS, "--shift-error", 0.1)
+        _, out, err = run(*command, "--json")
+        (found,) = json.loads(out)["patterns"]
+        assert found["findings"][0]["kind"] == "unused"
+        assert found["findings"][0]["message"] in err
+
     def test_finds_patterns(self, run):
         status, out, _ = run("plan", "--shape", 64, 80, "--max-shift", 9, 9, "--drift", 0, "--json")
         assert status == 0
@@ -555,7 +577,12 @@ def test_frames_of_different_things_are_noticed_in_an_average(run, tmp_path):
         frames = np.rint(level + 3 * rng.standard_normal((4, 20, 24))).astype(np.uint16)
         write_frames(tmp_path / f"{name}.tif", iter(frames), nbytes=frames.nbytes)
     for source, words in (("light.tif", ""), ("*.tif", "see that all are of one measurement")):
-        status, _, said = run("average", tmp_path / source, "-o", tmp_path / f"out{len(words)}.npz")
+        output = tmp_path / f"out{len(words)}.npz"
+        status, out, said = run("average", tmp_path / source, "-o", output, "--json")
         assert status == 0
         assert words in said
         assert bool(words) == bool(said)
+        found = [dataclasses.asdict(each) for each in equipix.load(output).findings]
+        assert [words in each["message"] for each in found] == [True] * bool(words)
+        for shown in (out, run("inspect", output, "--json")[1]):
+            assert json.loads(shown)["findings"] == found

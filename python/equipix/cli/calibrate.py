@@ -59,7 +59,7 @@ def calibrate(
         calibration = loaded.run(mask=excluded, workers=workers, progress=progress, **options)
     if not partial:
         _refuse_partial(calibration, output)
-    show_saved(output, calibration, calibration.findings, force=force, as_json=as_json)
+    show_saved(output, calibration, force=force, as_json=as_json)
 
 
 def _refuse_partial(calibration: Calibration, output: Path) -> None:

@@ -1,5 +1,6 @@
 """Commands about frames: average, correct."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,7 +10,7 @@ from equipix.cli import terminal
 from equipix.cli.summary import known, show_saved
 from equipix.correction.correct_files import correct_files, is_folder
 from equipix.errors import InputError
-from equipix.experiment.image_files import origin_of, refuse_repeated_files
+from equipix.experiment.image_files import origin_of, refuse_repeated_files, with_inputs
 from equipix.findings import ask, say
 from equipix.io.formats import SUFFIXES
 from equipix.io.paths import find_files, refuse_inputs
@@ -42,7 +43,7 @@ def average(
     terminal.check_output(output, force=force, suffixes=SUFFIXES)
     images, offsets = find_files(frames), find_files(dark) if dark else []
     refuse_inputs([output], [*images, *offsets, *terminal.given(mask)])
-    refuse_repeated_files(images, offsets)
+    hashes = refuse_repeated_files(images, offsets)
     with terminal.working(mask) as (progress, excluded):
         offset = None
         common: dict[str, Any] = {"workers": workers, "progress": progress}
@@ -53,7 +54,8 @@ def average(
             statistics.refuse_subtracted(offset, " ".join(dark))
         found = average_frames(frames, dark=offset, mask=excluded, **common, **options)
     said = say(*ask(statistics.AVERAGED, found))
-    show_saved(output, found, said, force=force, as_json=as_json)
+    found = replace(found, findings=said, metadata=with_inputs(found.metadata, hashes))
+    show_saved(output, found, force=force, as_json=as_json)
 
 
 @commands.command(epilog="Example: equipix correct cal.tif raw/*.tif -o corrected/")
@@ -106,7 +108,7 @@ def correct(
         unusable_pixels=done.flagged or None,
     )
     result = {"output": str(output), "frames": done.frames, "dtype": done.dtype, **counts}
-    terminal.show_result(result, as_json=as_json)
+    terminal.show_result(result, done.findings, as_json=as_json)
 
 
 def _refuse_image(output: Path) -> None:

@@ -1,5 +1,6 @@
 """The command about corrections from the scene: scene."""
 
+from dataclasses import replace
 from inspect import signature
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -7,8 +8,9 @@ from typing import Annotated, Any, Literal
 import typer
 
 from equipix.cli import terminal
-from equipix.cli.summary import of_scene, told
+from equipix.cli.summary import of_scene
 from equipix.errors import FileError, InputError
+from equipix.experiment.image_files import sha256_of, with_inputs
 from equipix.io.formats import SUFFIXES, raw_header
 from equipix.io.paths import find_files, refuse_inputs
 from equipix.io.record import read_record
@@ -89,13 +91,16 @@ def scene(
         learning = _method(method, frames, chosen, resume, workers)
         done = run_sequence(learning, frames, output=corrected, force=force, progress=progress)
     result = learning.correction()
+    used = sha256_of([*dict.fromkeys(find_files(frames)), *terminal.given(resume, mask)])
+    metadata, said = with_inputs(result.metadata, used), done.findings + result.findings
+    result = replace(result, metadata=metadata, findings=said)
     result.save(output, force=force)
     if state is not None:
         learning.save(state, force=force)
     if picture is not None:
         save_figure(draw_sequence(done, result), picture, force=force)
     figures = _summary(output, learning, done)
-    terminal.show_result(figures | told(result.findings, as_json=as_json), as_json=as_json)
+    terminal.show_result(figures, result.findings, as_json=as_json)
 
 
 def _method(

@@ -1,7 +1,6 @@
 """Main figures of what the command line reads and writes."""
 
-from collections.abc import Callable, Iterable
-from dataclasses import asdict
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ from equipix.bolometer.dynamic import DynamicCorrection
 from equipix.calibration.result import Calibration
 from equipix.cli import terminal
 from equipix.correction.protocol import Correction, sensor_of
-from equipix.findings import Finding, Flag, usable
+from equipix.findings import Flag, usable
 from equipix.io.record import Record
 from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.response import Response, common_misfit
@@ -29,25 +28,19 @@ def summary(content: Record | Correction | SceneCorrection) -> dict[str, Any]:
     return figures(content)
 
 
-def show_saved(
-    output: Path, result: Record, findings: Iterable[Finding], *, force: bool, as_json: bool
-) -> None:
+_Saved = Calibration | FrameStatistics | Response
+
+
+def show_saved(output: Path, result: _Saved, *, force: bool, as_json: bool) -> None:
     """Save a result, and print its main figures and its findings."""
     result.save(output, force=force)
-    figures = {"output": str(output), **summary(result), **told(findings, as_json=as_json)}
-    terminal.show_result(figures, as_json=as_json)
+    figures = {"output": str(output), **summary(result)}
+    terminal.show_result(figures, result.findings, as_json=as_json)
 
 
 def known(**figures: Any) -> dict[str, Any]:
     """Leave out what is not known."""
     return {name: value for name, value in figures.items() if value not in (None, "")}
-
-
-def told(findings: Iterable[Finding], *, as_json: bool = True) -> dict[str, Any]:
-    """Findings; their kinds alone where messages are on stderr, as warnings, already."""
-    if as_json:
-        return {"findings": [asdict(each) for each in findings]}
-    return {"findings": ", ".join(each.kind for each in findings) or "none"}
 
 
 def _of_correction(correction: Correction) -> dict[str, Any]:
@@ -60,7 +53,7 @@ def _of_correction(correction: Correction) -> dict[str, Any]:
         "order": len(correction.coefficients) - 1,
         **{f"scene_{name}": learned[name] for name in _LEARNED if name in learned},
         "flagged_pixels": flagged(correction),
-        **told(correction.findings),
+        **terminal.told(correction.findings),
     }
 
 
@@ -84,7 +77,7 @@ def of_response(response: Response) -> dict[str, Any]:
         "largest_inverse_error": response.largest_inverse_error,
         **known(prediction_errors=options.get("prediction_errors")),
         "flagged_pixels": flagged(response),
-        **told(response.findings),
+        **terminal.told(response.findings),
     }
 
 
@@ -127,7 +120,7 @@ def of_dynamic(correction: DynamicCorrection) -> dict[str, Any]:
         "bias_order": correction.axes.bias_order,
         "gain_order": None if correction.gain is None else correction.gain_axes.order,
         "flagged_pixels": flagged(correction),
-        **told(correction.findings),
+        **terminal.told(correction.findings),
     }
 
 
@@ -158,6 +151,7 @@ def of_statistics(frames: FrameStatistics) -> dict[str, Any]:
         "saturated_pixels": int(np.count_nonzero(frames.saturated)),
         **known(rejected_beyond_sigmas=frames.reject),
         "dark_frames": 0 if frames.dark is None else int(frames.dark.count.max()),
+        **terminal.told(frames.findings),
     }
 
 
@@ -192,7 +186,7 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
         "flagged_pixels": flagged(calibration),
         **_rejected(calibration),
         "is_partial": calibration.is_partial,
-        **told(calibration.findings),
+        **terminal.told(calibration.findings),
     }
 
 

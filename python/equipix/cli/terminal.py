@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,6 +18,7 @@ from equipix._check import Array, Bools, Progress
 from equipix.correction.correct_files import warn_of_corrected
 from equipix.errors import FileError, InputError
 from equipix.experiment import image_files
+from equipix.findings import Findings
 from equipix.io.formats import raw_header
 from equipix.io.frames import read_frames, read_mask
 from equipix.io.paths import find_files, refuse_inputs
@@ -62,8 +64,14 @@ def _announcer() -> Progress:
     return report
 
 
-def show_result(result: dict[str, Any], *, as_json: bool) -> None:
-    """Print a result as one JSON object or as a table."""
+def told(findings: Findings, *, as_json: bool = True) -> dict[str, Any]:
+    """Findings; their kinds alone where messages are on stderr, as warnings, already."""
+    return {"findings": [asdict(each) if as_json else each.kind for each in findings]}
+
+
+def show_result(result: dict[str, Any], found: Findings | None = None, *, as_json: bool) -> None:
+    """Print a result as one JSON object or as a table, with its findings where it can have any."""
+    result = result if found is None else result | told(found, as_json=as_json)
     if as_json:
         print(json.dumps(_json_value(result), allow_nan=False))  # noqa: T201
         return
@@ -117,13 +125,13 @@ def check_output(
     refuse_inputs([path], list(inputs))
 
 
-def raw_frames(frames: Iterable[str], correction: Path | None = None) -> Array:
+def raw_frames(frames: Iterable[str], correction: Path | None = None) -> tuple[Array, Findings]:
     """Read raw frames; refuse files that equipix has saved, and warn of those it has corrected."""
     files = find_files(frames)
     headers = {file: raw_header(file) for file in files}
-    if correction is not None:
-        warn_of_corrected(headers, image_files.origin_of(correction))
-    return read_frames(files)
+    origin = "" if correction is None else image_files.origin_of(correction)
+    said = warn_of_corrected(headers, origin)
+    return read_frames(files), said
 
 
 def given(*paths: Path | None) -> list[Path]:

@@ -10,7 +10,7 @@ from equipix._check import Array, Bools, Flagged, Floats, as_array, naming_memor
 from equipix.correction.apply import CorrectionBase, apply, checked_frames
 from equipix.correction.protocol import Dark, named_cfa, with_dark
 from equipix.errors import InputError
-from equipix.findings import Finding, usable
+from equipix.findings import Findings, usable
 from equipix.io.record import Counts, Doubles, Map, Record
 from equipix.measured.colour import Colours
 from equipix.measured.noise import median_of_noise
@@ -90,7 +90,7 @@ class Response(CorrectionBase, Record, kind="response", version=2):
     metadata: dict[str, Any] = field(default_factory=dict)
     cfa: Colours | None = None
     colour_response: dict[str, float] | None = None
-    findings: tuple[Finding, ...] = ()
+    findings: Findings = ()
     takes_dark: ClassVar[bool] = True
     needs_dark: ClassVar[bool] = False
 
@@ -242,8 +242,10 @@ class Response(CorrectionBase, Record, kind="response", version=2):
         low, high = self.valid_range if offset is None else self.valid_range + offset
         return np.asarray(~((raw >= low) & (raw <= high)))
 
-    def with_flags(self, flags: Array, *, cfa: ArrayLike | None = None) -> Self:
-        """Return a copy with more flags, such as those of `find_defects`.
+    def with_flags(
+        self, flags: Array, *, cfa: ArrayLike | None = None, findings: Findings = ()
+    ) -> Self:
+        """Return a copy with more flags and findings, such as those of `find_defects`.
 
         Parameters
         ----------
@@ -252,12 +254,14 @@ class Response(CorrectionBase, Record, kind="response", version=2):
         cfa : str or array_like of labels, optional
             Colour filters of the pixels, as for `find_defects`, where the response was fitted
             without: flagged pixels are then replaced within a colour. Curves do not change.
+        findings : tuple of Finding
+            What limits the flags; those that the response has already are not repeated.
 
         Returns
         -------
         Response
-            The copy; these flags survive saving, and so do filters, as ``cfa`` of the sensor in
-            `metadata`.
+            The copy; flags and findings survive saving, and so do filters, as ``cfa`` of the
+            sensor in `metadata`.
 
         Raises
         ------
@@ -279,7 +283,9 @@ class Response(CorrectionBase, Record, kind="response", version=2):
         colours, metadata = named_cfa(self, cfa), self.metadata
         if colours not in (None, self.cfa):
             metadata = {**metadata, "sensor": {**metadata.get("sensor", {}), "cfa": colours.rows}}
-        return replace(self, flags=self.flags | more.astype(np.uint32), metadata=metadata)
+        said = tuple(dict.fromkeys(self.findings + findings))
+        combined = self.flags | more.astype(np.uint32)
+        return replace(self, flags=combined, metadata=metadata, findings=said)
 
 
 def common_misfit(response: Response) -> float:
