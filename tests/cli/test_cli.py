@@ -226,6 +226,19 @@ def test_average_writes_statistics(run, experiment, tmp_path):
     }
 
 
+def test_what_an_average_does_not_determine_is_said_in_words(run, tmp_path):
+    frame = np.arange(20 * 24, dtype=np.float32).reshape(20, 24)
+    write_frames(tmp_path / "one.tif", iter([frame]), nbytes=1)
+    command = ("average", tmp_path / "one.tif", "-o", tmp_path / "mean.npz")
+    status, out, _ = run(*command)
+    assert status == 0
+    rows = dict(re.split("  +", line, maxsplit=1) for line in out.splitlines())
+    assert (rows["variance"], rows["saturation"]) == ("not determined", "none")
+    assert rows["findings"] == "none"
+    told = json.loads(run(*command, "--json", "--force")[1])
+    assert (told["variance"], told["saturation"]) == (None, None)
+
+
 def test_correct_to_one_file_and_to_a_folder(run, experiment, calibration, tmp_path):
     inputs = [experiment.parent / f"frames/p{k}.tif" for k in range(2)]
     expected = equipix.load(calibration).correct(read_frames(inputs), flagged="replace")

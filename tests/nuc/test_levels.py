@@ -274,6 +274,7 @@ class TestCommands:
         (tmp_path / "levels.toml").write_text("[[level]]".join(two[:3]), encoding="utf-8")
         status, out, _ = run(*given)
         assert "reduced chi2           not determined" in out
+        assert json.loads(run(*given, "--json")[1])["reduced_chi2"] is None
 
     def test_errors_are_one_line(self, run, folder, tmp_path):
         output = tmp_path / "response.tif"

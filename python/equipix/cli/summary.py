@@ -81,12 +81,11 @@ def of_response(response: Response) -> dict[str, Any]:
     }
 
 
-def _colours(correction: Calibration | Response) -> dict[str, str]:
+def _colours(correction: Calibration | Response) -> dict[str, Any]:
     """Colour filters and the responses of the colours, of mean 1, where there are any."""
     if correction.cfa is None or correction.colour_response is None:
         return {}
-    found = [f"{label} {value:.4g}" for label, value in correction.colour_response.items()]
-    return {"cfa": str(correction.cfa), "colour_response": ", ".join(found)}
+    return {"cfa": str(correction.cfa), "colour_response": correction.colour_response}
 
 
 def _level_values(response: Response) -> dict[str, list[str]]:
@@ -100,12 +99,10 @@ def _level_values(response: Response) -> dict[str, list[str]]:
     return {"level_values": [" ".join(each.split()) for each in texts]} if named else {}
 
 
-def _misfit(response: Response, options: dict[str, Any]) -> float | str:
+def _misfit(response: Response, options: dict[str, Any]) -> float:
     """Median reduced χ² over that of noise; without variances the mean, a variance in DN²."""
     judged = usable(response.flags) & (response.freedom > 0)
-    if not judged.any():
-        return "not determined"
-    if options.get("weights") == "equal":
+    if options.get("weights") == "equal" and judged.any():
         return float(np.mean(response.reduced_chi2[judged]))
     return common_misfit(response)
 
@@ -133,7 +130,7 @@ def of_scene(method: SceneCorrection) -> dict[str, Any]:
         "usable_frames": method.frames_taken,
         "frames_that_counted": method.frames,
         "frames_foreign": method.frames_foreign,
-        "floor_dn": method.floor,
+        "floor_dn": np.nan if (floor := method.floor) is None else floor,
         "gain_rms": float(np.std(method.gain)),
         "offset_rms": float(np.std(method.offset)),
     }

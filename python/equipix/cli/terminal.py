@@ -206,11 +206,13 @@ def _words(value: Any) -> str:
     match value:
         case bool():
             return "yes" if value else "no"
+        case float() if math.isnan(value):
+            return "not determined"
         case float():
             return f"{value:.0f}" if value.is_integer() and abs(value) < _WHOLE else f"{value:.4g}"
         case dict():
             return ", ".join(f"{name} {_words(item)}" for name, item in value.items()) or "none"
-        case []:
+        case [] | () | None:
             return "none"
         case [dict(), *_]:
             return "\n".join(map(_row, value))
