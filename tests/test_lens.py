@@ -292,7 +292,7 @@ class TestCombine:
             with pytest.raises(errors.InputError, match="'then' holds the offsets of raw levels"):
                 equipix.combine(falloff, then)
         learned = equipix.scene.ConstantStatistics(SHAPE, (0.0, 1.0))
-        for each in simulate.MovingScene(seed=1, shape=SHAPE).frames(5):
+        for each in simulate.MovingScene(seed=1, shape=SHAPE).frames(40):
             learned.update(each.values)
         learned.correction().save(tmp_path / "scene.npz")
         for then in (learned.correction(), equipix.load(tmp_path / "scene.npz")):

@@ -599,3 +599,24 @@ def test_frames_of_different_things_are_noticed_in_an_average(run, tmp_path):
         assert [words in each["message"] for each in found] == [True] * bool(words)
         for shown in (out, run("inspect", output, "--json")[1]):
             assert json.loads(shown)["findings"] == found
+
+
+@pytest.mark.parametrize(("rows", "says"), [(10, False), (9, True)])
+def test_an_average_that_saturates_in_most_pixels_is_noticed(run, tmp_path, rows, says):
+    frames = np.full((4, 20, 24), 2000, np.uint16)
+    frames[:, :rows] = 500
+    write_frames(tmp_path / "raw.tif", iter(frames), nbytes=frames.nbytes)
+    arguments = ("average", tmp_path / "raw.tif", "-o", tmp_path / "out.npz", "--saturation", 1000)
+    status, _, said = run(*arguments)
+    assert status == 0
+    words = "264 of 480 unmasked pixels (limit 50%) reach the saturation level of 1000.0 DN: expose"
+    assert (words in said) == says
+    assert bool(said) == says
+
+
+def test_an_average_of_frames_without_a_number_is_refused(run, tmp_path):
+    frames = np.full((4, 20, 24), np.nan, np.float32)
+    write_frames(tmp_path / "raw.tif", iter(frames), nbytes=frames.nbytes)
+    out = tmp_path / "out.npz"
+    refused(run("average", tmp_path / "raw.tif", "-o", out), "'frames' holds no finite number")
+    assert not out.exists()

@@ -579,7 +579,9 @@ class TestRefusals:
             nuc.fit(levels)
         with pytest.raises(errors.InputError, match=r"'levels' has shape \(0,\)"):
             nuc.fit([])
-        with pytest.raises(errors.InputError, match="'levels' is one average, expected a list"):
+        with pytest.raises(
+            errors.InputError, match="'levels' is one FrameStatistics, expected a list"
+        ):
             nuc.fit(equipix.average(levels))
 
     def test_levels_of_other_shapes(self, levels):

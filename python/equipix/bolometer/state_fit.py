@@ -170,8 +170,6 @@ def _order(
 
 def references_of(name: str, given: Any) -> Measured:
     """Mean frames of all states; of averages with the variances of their means."""
-    if isinstance(given, FrameStatistics):
-        raise InputError(f"'{name}' is one FrameStatistics, expected a sequence: one a state")
     listed: list[Any] = list(given) if isinstance(given, list | tuple) else []
     averages = [each for each in listed if isinstance(each, FrameStatistics)]
     means = [each.mean if isinstance(each, FrameStatistics) else each for each in listed]

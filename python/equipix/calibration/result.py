@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from equipix._check import (
     Array,
@@ -371,16 +371,18 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
         c_0 = −dark/M and c_1 = 1/M, in the dtype of `sensitivity`; NaN where M is undetermined.
         Without a dark frame in the calibration c_0 is 0, for frames whose dark is subtracted.
         """
-        return self._planes.astype(self.sensitivity.dtype)
+        return self._planes(self.sensitivity.dtype)
 
-    @property
-    def _planes(self) -> NDArray[Any]:
-        """The coefficients in double precision."""
+    def _planes(self, dtype: DTypeLike) -> NDArray[Any]:
+        """The coefficients, found in double precision and rounded once."""
+        planes = np.zeros((2, *self.shape), dtype)
         with np.errstate(divide="ignore", invalid="ignore"):  # a dead pixel may have M = 0
-            inverse = 1 / self.sensitivity.astype(np.float64)
-            offset = np.zeros_like(inverse) if self.dark is None else -self.dark * inverse
-        offset[np.isnan(inverse)] = np.nan
-        return np.stack([offset, inverse])
+            inverse = np.divide(1, self.sensitivity, dtype=np.float64)
+            if self.dark is not None:
+                planes[0] = -self.dark * inverse
+        planes[0, np.isnan(inverse)] = np.nan
+        planes[1] = inverse
+        return planes
 
     def predict(self, shift: ArrayLike, *, rotation: int = 0, flux: float = 1.0) -> NDArray[Any]:
         """Frame that the sensor would give at another position: c · L(u) · M(p).

@@ -16,8 +16,8 @@ from equipix.io.paths import find_files, refuse_inputs
 from equipix.io.record import read_record
 from equipix.pictures import check_picture, draw_sequence, save_figure
 from equipix.scene.methods import METHODS, resumed
-from equipix.scene.scene_correction import SceneCorrection, SceneState
-from equipix.scene.sequence import SequenceResult, check_range, run_sequence
+from equipix.scene.scene_correction import SceneCorrection, SceneState, check_range
+from equipix.scene.sequence import SequenceResult, run_sequence
 
 commands = typer.Typer()
 
@@ -124,7 +124,7 @@ def _method(
             )
         if state.method != name:
             raise InputError(f"{resume}: is of --method {state.method}, not of {name}: name that")
-        check_range(state.data_range, dtype, resume)
+        check_range(state.data_range, dtype, str(resume))
         return resumed(resume, state, workers=workers)
     if "data_range" not in options and dtype.kind != "u":
         raise InputError(

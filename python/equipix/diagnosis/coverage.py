@@ -10,9 +10,7 @@ from equipix.exposures.exposures import Exposures
 from equipix.exposures.positions import whole_moves
 from equipix.findings import Flag, usable
 from equipix.fitting.error_bars import fits_noise
-
-_LEAST = 0.5
-"""Least share of the pixels not masked by the caller that a calibration must determine."""
+from equipix.measured.statistics import FEWEST_USABLE, SATURATED
 
 _LARGEST_ERROR = 1.0
 """Largest estimated relative error of M: above it, M is not determined to its first digit."""
@@ -61,11 +59,11 @@ def too_few(evidence: Evidence) -> str | None:
     wanted = _wanted(evidence.exposures)
     determined = usable(evidence.flags) & wanted
     count, total = int(determined.sum()), int(wanted.sum())
-    if count >= _LEAST * total:
+    if count >= FEWEST_USABLE * total:
         return None
     return (
-        f"the exposures determine only {count} of {total} unmasked pixels (limit {_LEAST:.0%}): "
-        f"{_cause(evidence, wanted & ~determined)}"
+        f"the exposures determine only {count} of {total} unmasked pixels (limit "
+        f"{FEWEST_USABLE:.0%}): {_cause(evidence, wanted & ~determined)}"
     )
 
 
@@ -84,10 +82,7 @@ def _cause(evidence: Evidence, missing: Bools) -> str:
     """Return what most of the missing pixels have in common, and the remedy."""
     exposures, flags = evidence.exposures, evidence.flags
     if _most(missing, exposures.bad_pixels.saturated):
-        return (
-            "most of the others reach the saturation level: expose less, or correct the level "
-            "('saturation', 'bit_depth')"
-        )
+        return f"most of the others reach the saturation level: {SATURATED}"
     if _most(missing, (flags & (Flag.DEAD | Flag.HOT)) != 0):
         return (
             "most of the others count as dead, hot or noisy: check the dark frames, and the gain "
@@ -129,4 +124,4 @@ def _mask_separates(exposures: Exposures) -> bool:
     whole = whole_moves(exposures.positions.shifts)
     _, counts, _ = _native.planned_components(exposures.shape, whole, rotation=rotation, mask=None)
     rows, cols = exposures.shape
-    return max(counts) >= _LEAST * rows * cols
+    return max(counts) >= FEWEST_USABLE * rows * cols

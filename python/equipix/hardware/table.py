@@ -8,16 +8,8 @@ from typing import ClassVar, NamedTuple, Self
 import numpy as np
 
 from equipix import _native
-from equipix._check import (
-    Array,
-    ArrayLike,
-    Flagged,
-    Floats,
-    naming_memory,
-    number,
-    positive_workers,
-)
-from equipix.correction.apply import RawCorrection, apply, checked_frames, each_frame
+from equipix._check import Array, ArrayLike, Floats, naming_memory, number, positive_workers
+from equipix.correction.apply import Formula, RawCorrection, checked_frames, each_frame
 from equipix.correction.protocol import Correction, Dark, check_correction, with_dark
 from equipix.errors import FileError, InputError
 from equipix.findings import Finding, usable
@@ -274,46 +266,16 @@ class Table(RawCorrection, Content):
         )
         return Applied(out, below, above)
 
-    def correct(
-        self,
-        frames: ArrayLike,
-        *,
-        dark: Dark = "stored",
-        flagged: Flagged = "nan",
-        out: Array | None = None,
-    ) -> Array:
-        """Raw frames as amplifier, ADC and table correct them, in DN.
-
-        Parameters
-        ----------
-        frames : array_like, shape (rows, cols) or (n, rows, cols)
-            Raw frames in DN, as without the DAC.
-        dark : "stored"
-            No other: the offsets are words of the table.
-        flagged : {"nan", "keep", "replace"}
-            The value of pixels flagged ``DO_NOT_USE``: NaN, the code 0, or the mean of the nearest
-            good pixels around.
-        out : ndarray, optional
-            Array for the result, of the frames' shape, float32 or float64.
-
-        Returns
-        -------
-        ndarray, of the frames' shape
-            Of dtype float64 for float64 frames, else float32; or `out`.
-
-        Raises
-        ------
-        InputError
-            If a shape does not fit, `flagged` is unknown, a usable pixel is not finite, or frames
-            are of another bit depth than the sensor.
-        """
+    def _formula(self, dark: Dark, exact: bool, /) -> Formula:
+        """Amplifier, ADC and table, in DN: the offsets are words, so no other dark is taken."""
         with_dark(self, dark)
+        super()._formula(dark, exact)
 
         def formula(frame: Array) -> Array:
             words = self.apply(self.digitise(frame))
             return np.ldexp(self.format.zero + words.astype(np.float64), self.format.out)
 
-        return apply(self, frames, dark, flagged, out, formula)
+        return formula
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Write to a file that `equipix.load` reads bit by bit.

@@ -78,7 +78,7 @@ def average(
     Raises
     ------
     InputError
-        If an argument has a wrong shape or value.
+        If an argument has a wrong shape or value, or no frame holds a finite number.
     FileError
         If a file is missing, broken, in colour, or differs from the first in shape or depth.
     InsufficientMemoryError
@@ -128,6 +128,8 @@ def average(
             statistics = _average_files(taken, how)
         else:
             statistics = _average_batches(batches(taken), how, operator.length_hint(frames))
+        if not statistics.count.any():
+            raise InputError("'frames' holds no finite number: give frames with numbers")
         options = {"saturation": how.level, "reject": statistics.reject}
         # A saved average brings its own.
         metadata = statistics.metadata or made(options=options, started=started)

@@ -179,6 +179,22 @@ def _on_bright_dark(statistics: FrameStatistics) -> str | None:
     return None
 
 
+SATURATED = "expose less, or correct the level ('saturation', 'bit_depth', average --saturation)"
+"""What to do where most pixels reach the saturation level."""
+
+FEWEST_USABLE = 0.5
+"""Least share of the pixels that are not masked to measure with."""
+
+
+def _on_saturation(statistics: FrameStatistics) -> str | None:
+    """Say that less than half of the pixels are free of saturation."""
+    total, count = map(np.count_nonzero, (statistics.count, statistics.saturated))
+    if total - count >= FEWEST_USABLE * total:
+        return None
+    share = f"{count} of {total} unmasked pixels (limit {1 - FEWEST_USABLE:.0%})"
+    return f"{share} reach the saturation level of {statistics.saturation} DN: {SATURATED}"
+
+
 def _on_light(statistics: FrameStatistics) -> str | None:
     """Say that frames are of several levels of light."""
     light = light_of(statistics)
@@ -188,6 +204,7 @@ def _on_light(statistics: FrameStatistics) -> str | None:
 
 
 AVERAGED: tuple[Rule[FrameStatistics], ...] = (
+    Rule("saturation", "input", _on_saturation),
     Rule("bright_dark", "input", _on_bright_dark),
     Rule("light", "misfit", _on_light),
 )

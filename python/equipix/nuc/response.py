@@ -6,8 +6,8 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from equipix._check import Array, Bools, Flagged, Floats, as_array, naming_memory
-from equipix.correction.apply import CorrectionBase, apply, checked_frames
+from equipix._check import Array, Bools, Floats, as_array, naming_memory
+from equipix.correction.apply import CorrectionBase, Formula, checked_frames
 from equipix.correction.protocol import Dark, named_cfa, with_dark
 from equipix.errors import InputError
 from equipix.findings import Findings, usable
@@ -156,59 +156,16 @@ class Response(CorrectionBase, Record, kind="response", version=2):
             f"<Response of {rows} x {cols} pixels, order {self.order}, {len(self.levels)} levels>"
         )
 
-    def correct(
-        self,
-        frames: ArrayLike,
-        *,
-        dark: Dark = "stored",
-        flagged: Flagged = "nan",
-        exact: bool = False,
-        out: Array | None = None,
-    ) -> Array:
-        """Frames as a sensor of equal pixels would have given them.
-
-        Parameters
-        ----------
-        frames : array_like, shape (rows, cols) or (n, rows, cols)
-            Frames in DN: raw ones if a dark is stored or the levels were raw.
-        dark : "stored", FrameStatistics, array_like of shape (rows, cols), or None
-            The dark frame to subtract, in DN: the stored one if there is one, another, or none
-            where it is already subtracted. A response to raw levels takes none.
-        flagged : {"nan", "keep", "replace"}
-            The value of pixels flagged ``DO_NOT_USE``: NaN, the value that the formula gives (NaN
-            still where the curve is undetermined), or the mean of the nearest good pixels around.
-        exact : bool
-            Whether to invert orders 2 and 3 exactly, some 20 times slower, with the slope at the
-            end of the valid range beyond it. The cubic differs by at most `inverse_error`.
-        out : ndarray, optional
-            Array for the result, of the frames' shape, float32 or float64; of frames of 8 or 16
-            bits and float32, unless `exact`, also uint8 or uint16, which hold no NaN: rounded half
-            to even, and limited to the range of the type (`equipix.Corrector` counts such values).
-
-        Returns
-        -------
-        ndarray, of the frames' shape
-            Of dtype float64 for float64 frames, else float32; or `out`. Values outside the valid
-            range are extrapolated: see `extrapolated`.
-
-        Raises
-        ------
-        InputError
-            If a shape does not fit, `flagged` is unknown, frames are of another bit depth, or a
-            dark is given to a response without one.
-        """
+    def _formula(self, dark: Dark, exact: bool, /) -> Formula | None:
+        """Exact inverse of the curves."""
         if not exact:
-            return super().correct(frames, dark=dark, flagged=flagged, out=out)
+            return None
         offset = with_dark(self, dark).dark
         zero = np.zeros(self.shape) if offset is None else offset
 
         # Curves that have an inverse.
         rising = np.where(np.isnan(self.inverse[0]), np.nan, self.deviation)
-
-        def formula(frame: Array) -> Array:
-            return exact_inverse(rising, frame - zero, self.limits)
-
-        return apply(self, frames, dark, flagged, out, formula)
+        return lambda frame: exact_inverse(rising, frame - zero, self.limits)
 
     @naming_memory("finding extrapolated values")
     def extrapolated(

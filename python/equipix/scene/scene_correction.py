@@ -30,6 +30,9 @@ DataRange = tuple[float, float]
 _FEW = 0.1
 """Share of the frames that counted below which it is a finding."""
 
+_FLOOR = 32
+"""Frames that count before the compiled part measures the floor."""
+
 _STILL = 0.25
 """Share of the field that never moved above which it is a finding."""
 
@@ -214,14 +217,15 @@ class SceneCorrection:
         Raises
         ------
         InputError
-            If the frame has another shape, or a finite value more than one span outside of the
-            range; then nothing has changed.
+            If the frame has another shape, a finite value more than one span outside of the range,
+            or whole numbers of a type that does not reach half of it; then nothing has changed.
         """
         raw = as_array("frame", frame, ndim=2)
         if raw.shape != self.shape or raw.dtype == np.bool_:
             raise InputError(
                 f"'frame' is {raw.dtype} of shape {raw.shape}, expected numbers of {self.shape}"
             )
+        check_range(self._range, raw.dtype, "'frame'")
         taken = raw if raw.dtype in _TAKEN else raw.astype(np.float64)
         corrected = np.empty(self.shape, np.float32)
         level = self.saturation
@@ -280,8 +284,8 @@ class SceneCorrection:
         Warns
         -----
         InputWarning
-            If less than a tenth of the usable frames counted, a quarter of the field never moved,
-            the frames use less than a third of the range, or the gains spread too far.
+            If fewer than 32 frames or a tenth of the usable ones counted, a quarter of the field
+            never moved, the frames use less than a third of the range, or the gains spread too far.
         """
         self.check_learned()
         gain, offset = (each.astype(np.float64) for each in self._native.coefficients())
@@ -332,6 +336,23 @@ class SceneCorrection:
         self._seen.masked_at, self._seen.peak = self.frames_taken, state.peak
 
 
+def check_range(data_range: DataRange, dtype: np.dtype[Any], place: str) -> None:
+    """Refuse frames of whole numbers whose type does not reach half of the range.
+
+    Raises
+    ------
+    InputError
+        With the place, the type and the range.
+    """
+    low, high = data_range
+    if dtype.kind in "iu" and np.iinfo(dtype).max < (low + high) / 2:
+        raise InputError(
+            f"{place}: the range of raw values is {low:g} to {high:g} DN, but the frames are "
+            f"{dtype}, up to {np.iinfo(dtype).max}: give frames of the same bits, or their range "
+            "as 'data_range' (--data-range)"
+        )
+
+
 def _mask_of(mask: ArrayLike | None, shape: tuple[int, int]) -> Array:
     """Pixels that are not used, where the mask is not 0."""
     if mask is None:
@@ -359,6 +380,16 @@ def _on_few(e: _Learned) -> str | None:
     return (
         f"{frames} of {taken} frames counted: the scene moved hardly, or "
         "its contrast is too low for its motion to be seen beside the pattern"
+    )
+
+
+def _on_floor(e: _Learned) -> str | None:
+    """Say that a pattern was learned of so few frames that what it leaves is not known."""
+    if e.method.frames >= _FLOOR:
+        return None
+    return (
+        f"only {e.method.frames} of the frames counted (limit {_FLOOR}, from which 'floor' is "
+        "measured): which part of the pattern is their scene is not known; take more frames"
     )
 
 
@@ -400,6 +431,7 @@ def _on_spread(e: _Learned) -> str | None:
 
 _RULES: tuple[Rule[_Learned], ...] = (
     Rule("unused", "input", _on_few),
+    Rule("few", "input", _on_floor, unless=frozenset({"unused"})),
     Rule("still", "input", _on_still),
     Rule("range", "input", _on_range),
     Rule("spread", "input", _on_spread),

@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -49,22 +48,6 @@ class SequenceResult:
     corrected: tuple[float, ...]
     last: Array
     findings: Findings
-
-
-def check_range(data_range: tuple[float, float], dtype: np.dtype[Any], state: Path) -> None:
-    """Refuse frames of whole numbers whose type does not reach half of the range of a state.
-
-    Raises
-    ------
-    InputError
-        With the file of the state, the type and the range.
-    """
-    low, high = data_range
-    if dtype.kind in "iu" and np.iinfo(dtype).max < (low + high) / 2:
-        raise InputError(
-            f"{state}: was learned from values of {low:g} to {high:g} DN, but the frames are "
-            f"{dtype}, up to {np.iinfo(dtype).max}: give frames of the same bits"
-        )
 
 
 def run_sequence(
