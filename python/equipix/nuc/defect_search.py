@@ -37,11 +37,7 @@ def mean_slope(response: Response) -> Floats:
 
 
 def of_response(
-    response: Response,
-    slope: Floats,
-    limits: DefectLimits,
-    misfit: float,
-    filters: Filters | None,
+    response: Response, slope: Floats, limits: DefectLimits, misfit: float, filters: Filters | None
 ) -> dict[str, Bools]:
     """Bad pixels by their curves of this mean slope; `misfit` is that of the array.
 
@@ -76,10 +72,7 @@ def _range(response: Response) -> Floats:
 
 
 def of_frames(
-    frames: ArrayLike | FrameStatistics,
-    good: Bools,
-    limits: DefectLimits,
-    cfa: Colours | None,
+    frames: ArrayLike | FrameStatistics, good: Bools, limits: DefectLimits, cfa: Colours | None
 ) -> tuple[dict[str, Bools], tuple[Finding, ...]]:
     """Bad pixels by their noise, and what limits it; `good` are those whose curves are usable."""
     slow, light = None, Light()

@@ -211,12 +211,7 @@ class Response(CorrectionBase, Record, kind="response", version=2):
         return apply(self, frames, dark, flagged, out, formula)
 
     @naming_memory("finding extrapolated values")
-    def extrapolated(
-        self,
-        frames: ArrayLike,
-        *,
-        dark: Dark = "stored",
-    ) -> Bools:
+    def extrapolated(self, frames: ArrayLike, *, dark: Dark = "stored") -> Bools:
         """Which values lie outside the range that the levels cover, so their correction is a guess.
 
         Parameters
