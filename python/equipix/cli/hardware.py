@@ -8,6 +8,7 @@ import typer
 
 from equipix._check import naming_memory
 from equipix.cli import terminal
+from equipix.cli.summary import told
 from equipix.correction.protocol import Correction, check_sensor
 from equipix.findings import usable
 from equipix.hardware.quality import quality, smallest_widths
@@ -62,17 +63,18 @@ def hardware(
     table = Table.of(correction, **options)
     cost = _cost(correction, frames, options) if frames else {}
     table.save(output, force=force)
-    terminal.show_result({"output": str(output), **_summary(table), **cost}, as_json=as_json)
+    figures = {"output": str(output), **_summary(table), **cost}
+    terminal.show_result(figures | told(table.findings, as_json=as_json), as_json=as_json)
 
 
 def _summary(table: Table) -> dict[str, Any]:
     """Collect the main figures of a table."""
-    told = asdict(table.format)
+    form = asdict(table.format)
     linearised = table.metadata.get("linearised")
     return {
         "shape": list(table.shape),
-        "bits": {name.removesuffix("_bits"): told[name] for name in told if "_bits" in name},
-        "steps": {name: 2.0 ** told[name] for name in STEPS},
+        "bits": {name.removesuffix("_bits"): form[name] for name in form if "_bits" in name},
+        "steps": {name: 2.0 ** form[name] for name in STEPS},
         "base": table.format.base,
         "zero": table.format.zero,
         "unusable_pixels": int((~usable(table.flags)).sum()),
