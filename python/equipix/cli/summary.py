@@ -12,6 +12,7 @@ from equipix.bolometer.dynamic import DynamicCorrection
 from equipix.calibration.result import Calibration
 from equipix.cli import terminal
 from equipix.correction.protocol import Correction, sensor_of
+from equipix.diagnosis.coverage import FAR
 from equipix.findings import Finding, Flag, usable
 from equipix.io.record import Record
 from equipix.measured.statistics import FrameStatistics
@@ -107,11 +108,11 @@ def _level_values(response: Response) -> dict[str, list[str]]:
     return {"level_values": [" ".join(each.split()) for each in texts]} if named else {}
 
 
-def _misfit(response: Response, options: dict[str, Any]) -> float | str:
+def _misfit(response: Response, options: dict[str, Any]) -> float:
     """Median reduced χ² over that of noise; without variances the mean, a variance in DN²."""
     judged = usable(response.flags) & (response.freedom > 0)
     if not judged.any():
-        return "not determined"
+        return np.nan
     if options.get("weights") == "equal":
         return float(np.mean(response.reduced_chi2[judged]))
     return common_misfit(response)
@@ -153,7 +154,7 @@ def of_statistics(frames: FrameStatistics) -> dict[str, Any]:
         "shape": list(frames.mean.shape),
         "frames": int(frames.count.max()),
         "mean": float(np.nanmean(frames.mean)),
-        "variance": float(np.nanmean(frames.variance)) if several else float("nan"),
+        "variance": float(np.nanmean(frames.variance)) if several else np.nan,
         "saturation": frames.saturation,
         "saturated_pixels": int(np.count_nonzero(frames.saturated)),
         **known(rejected_beyond_sigmas=frames.reject),
@@ -172,7 +173,7 @@ def flagged(correction: Correction | DynamicCorrection) -> dict[str, int]:
 
 def of_calibration(calibration: Calibration) -> dict[str, Any]:
     """Collect the main figures of a calibration."""
-    sensitivity = calibration.sensitivity
+    sensitivity, components = calibration.sensitivity, calibration.components
     options = calibration.metadata.get("options", {})
     return {
         **known(sensor=sensor_of(calibration)),
@@ -185,7 +186,7 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
         "error_estimate": calibration.error_estimate,
         "sweeps": calibration.sweeps,
         _misfit_name(options): calibration.reduced_chi2,
-        "components": calibration.components,
+        "components": components if components > 1 or calibration.error_estimate <= FAR else np.nan,
         "shift_sign": calibration.shift_sign,
         **known(orientation=calibration.orientation and calibration.orientation.words),
         "fluxes": options.get("flux", "known"),
