@@ -203,10 +203,10 @@ FRAMES = np.zeros((3, 4, 5), np.uint8)
         (np.zeros((2, 4, 5), complex), {}, "'frames' has dtype complex128"),
         ([], {}, "'frames' holds no frames"),
         (7, {}, "'frames' is a int"),
-        ([FRAMES[0], FRAMES[0, 1:]], {}, r"'source\[1\]' is uint8 of shape \(3, 5\)"),
-        ([FRAMES[0], FRAMES[0].astype(float)], {}, r"'source\[1\]' is float64"),
-        ([FRAMES], {}, r"'source\[0\]' has shape \(3, 4, 5\)"),
-        ([None], {}, r"'source\[0\]' has dtype object"),
+        ([FRAMES[0], FRAMES[0, 1:]], {}, r"frame 1 is uint8 of shape \(3, 5\)"),
+        ([FRAMES[0], FRAMES[0].astype(float)], {}, r"frame 1 is float64"),
+        ([FRAMES], {}, r"'frame 0' has shape \(3, 4, 5\)"),
+        ([None], {}, r"'frame 0' has dtype object"),
         (FRAMES, {"dark": np.zeros((5, 4))}, r"'dark' has shape \(5, 4\), expected \(4, 5\)"),
         (FRAMES, {"dark": np.zeros(4)}, "'dark' has shape"),
         (FRAMES, {"dark": np.full((4, 5), np.nan)}, "'dark' holds no finite number"),
@@ -344,7 +344,7 @@ def test_masked_whole_numbers_keep_their_saturation_level() -> None:
 
 def test_frames_with_a_mask_and_without_are_not_mixed() -> None:
     frame = np.ones((3, 4))
-    with pytest.raises(InputError, match=r"'source\[1\]' is masked float64 .*, expected float64"):
+    with pytest.raises(InputError, match=r"frame 1 is masked float64 .*, expected float64"):
         equipix.average([frame, np.ma.masked_equal(frame, 2)])
 
 
