@@ -141,8 +141,8 @@ def test_files_that_their_names_belie(manifest, tmp_path, capsys):
         run("calibrate", manifest, "-o", tmp_path / "c.tif", "--mask", tmp_path / "mask.npy") == 1
     )
     said = capsys.readouterr().err
-    assert "cal.npz: cannot be read: File is not a zip file" in said
-    assert "mask.npy: is no .npy file" in said
+    assert "cal.npz: cannot be read: incomplete, damaged, or no .npz file: use a copy" in said
+    assert "mask.npy: cannot be read: incomplete, damaged, or no .npy file" in said
     assert "pickle" not in said
 
 

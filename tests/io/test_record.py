@@ -167,7 +167,7 @@ def test_a_table_is_read_by_its_suffix(tmp_path):
     for suffix in (".bin", ".hex", ".h"):
         table.save(tmp_path / f"a{suffix}")
         assert differences(table, equipix.load(tmp_path / f"a{suffix}")) == []
-    with pytest.raises(FileError, match=r"none\.bin: cannot be read"):
+    with pytest.raises(FileError, match=r"none\.bin: does not exist"):
         equipix.load(tmp_path / "none.bin")
 
 

@@ -88,7 +88,8 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
     components : int
         Number of connected components: parts of the sensor that the measurements do not compare.
         A pixel that does not respond connects no parts; nor does one whose measurements have
-        almost no weight.
+        almost no weight. Where shifts differ by parts of pixels, neighbours see cells in common,
+        so that 1 does not prove that the positions determine the sensitivity: see `is_partial`.
     component_labels : ndarray, shape (rows, cols), int32
         The component of each pixel, the largest being 0; −1 for a pixel without measurement.
     sweeps : int
@@ -293,11 +294,7 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
         return dataclasses.replace(self)
 
     def std_of(
-        self,
-        weights: ArrayLike,
-        *,
-        workers: int | None = None,
-        progress: Progress | None = None,
+        self, weights: ArrayLike, *, workers: int | None = None, progress: Progress | None = None
     ) -> float | NDArray[Any]:
         """Standard deviation of Σ weights · ln M by noise, large scales included.
 

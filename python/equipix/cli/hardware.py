@@ -68,12 +68,12 @@ def hardware(
 
 def _summary(table: Table) -> dict[str, Any]:
     """Collect the main figures of a table."""
-    told = asdict(table.format)
+    form = asdict(table.format)
     linearised = table.metadata.get("linearised")
     return {
         "shape": list(table.shape),
-        "bits": {name.removesuffix("_bits"): told[name] for name in told if "_bits" in name},
-        "steps": {name: 2.0 ** told[name] for name in STEPS},
+        "bits": {name.removesuffix("_bits"): form[name] for name in form if "_bits" in name},
+        "steps": {name: 2.0 ** form[name] for name in STEPS},
         "base": table.format.base,
         "zero": table.format.zero,
         "unusable_pixels": int((~usable(table.flags)).sum()),

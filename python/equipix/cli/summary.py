@@ -11,6 +11,7 @@ from equipix.bolometer.dynamic import DynamicCorrection
 from equipix.calibration.result import Calibration
 from equipix.cli import terminal
 from equipix.correction.protocol import Correction, sensor_of
+from equipix.diagnosis.coverage import FAR
 from equipix.findings import Flag, usable
 from equipix.io.record import Record
 from equipix.measured.statistics import FrameStatistics
@@ -143,7 +144,7 @@ def of_statistics(frames: FrameStatistics) -> dict[str, Any]:
         "shape": list(frames.mean.shape),
         "frames": int(frames.count.max()),
         "mean": float(np.nanmean(frames.mean)),
-        "variance": float(np.nanmean(frames.variance)) if several else float("nan"),
+        "variance": float(np.nanmean(frames.variance)) if several else np.nan,
         "saturation": frames.saturation,
         "saturated_pixels": int(np.count_nonzero(frames.saturated)),
         **known(rejected_beyond_sigmas=frames.reject),
@@ -163,7 +164,7 @@ def flagged(correction: Correction | DynamicCorrection) -> dict[str, int]:
 
 def of_calibration(calibration: Calibration) -> dict[str, Any]:
     """Collect the main figures of a calibration."""
-    sensitivity = calibration.sensitivity
+    sensitivity, components = calibration.sensitivity, calibration.components
     options = calibration.metadata.get("options", {})
     return {
         **known(sensor=sensor_of(calibration)),
@@ -176,7 +177,7 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
         "error_estimate": calibration.error_estimate,
         "sweeps": calibration.sweeps,
         _misfit_name(options): calibration.reduced_chi2,
-        "components": calibration.components,
+        "components": components if components > 1 or calibration.error_estimate <= FAR else np.nan,
         "shift_sign": calibration.shift_sign,
         **known(orientation=calibration.orientation and calibration.orientation.words),
         "fluxes": options.get("flux", "known"),

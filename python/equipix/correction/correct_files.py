@@ -114,8 +114,8 @@ def correct_files(
     Raises
     ------
     FileError
-        If a file cannot be read or written, two outputs would have the same name, or one would
-        replace an input.
+        If a file cannot be read or written, an input is named twice, two outputs would have the
+        same name, or one would replace an input.
     InputError
         If the frames have another shape than the correction, it takes no other dark frame, or more
         than one frame would go to a .png, or floating-point numbers.
@@ -131,6 +131,7 @@ def correct_files(
     """
     wanted = _dtype(output, dtype, bit_depth, display)
     files = find_files(source)
+    refuse_inputs(files, [], "is named twice: name each input once")
     outputs = _outputs(output, files)
     refuse_inputs(outputs, files)
     headers = raw_headers(files, correction.shape)

@@ -12,8 +12,12 @@ from equipix.findings import Flag, usable
 from equipix.fitting.error_bars import fits_noise
 from equipix.measured.statistics import FEWEST_USABLE, SATURATED
 
-_LARGEST_ERROR = 1.0
+FAR = 1.0
 """Largest estimated relative error of M: above it, M is not determined to its first digit."""
+
+_OFF_LINE = 0.5
+"""Root of the sum of squares of distances from a line, in pixels, up to which positions lie on it.
+"""
 
 _FEWEST = 3
 """Fewest exposures that compare pixels along both axes."""
@@ -24,6 +28,12 @@ TOO_WEAK = (
     "light or more frames, mask pixels that receive almost no light, and see that the shifts are "
     "those of the frames"
 )
+
+
+def why_weak(exposures: Exposures) -> str:
+    """Return why a fit does not come near its minimum: the positions, or else the light."""
+    cause = _uncompared(exposures)
+    return f"the positions do not determine the sensitivity, since {cause}" if cause else TOO_WEAK
 
 
 def left_out(fit: Fit) -> str:
@@ -42,15 +52,15 @@ def too_far(evidence: Evidence) -> str | None:
     """Say that the fit ended so far from its minimum that it determines no pixel."""
     fit = evidence.fit
     error = float(fit.error_estimate[-1])
-    if error <= _LARGEST_ERROR:  # a NaN is not
+    if error <= FAR:  # a NaN is not
         return None
     more = "use larger shifts in a beam with more structure"
     if fit.ended == "sweeps used":
         more = f"allow more sweeps, or {more}"
     return (
         "the fit ended far from its minimum, and determines no pixel (estimated relative error "
-        f"{error:.1e}, limit {_LARGEST_ERROR:g}): "
-        f"{TOO_WEAK if fits_noise(fit) else more}{left_out(fit)}"
+        f"{error:.1e}, limit {FAR:g}): "
+        f"{why_weak(evidence.exposures) if fits_noise(fit) else more}{left_out(fit)}"
     )
 
 
@@ -100,22 +110,31 @@ def _most(missing: Bools, found: Bools | None) -> bool:
 
 def _cause_in_shifts(exposures: Exposures, components: int) -> str:
     """Return why the shifts leave pixels unconnected."""
-    shifts, count = exposures.positions.shifts, len(exposures)
-    away = shifts - shifts[0]
-    turned = exposures.positions.are_turned
     result = f"the shifts leave {components} parts of the sensor unconnected"
-    if not away.any() and not turned:
-        return f"{result}, since they are all alike: move the sensor between exposures"
-    if count < _FEWEST:
-        return (
-            f"{result}, since {count} exposures compare pixels along one direction only: take at "
-            f"least {_FEWEST}, at positions that do not lie on one line"
-        )
-    if not turned and np.linalg.matrix_rank(away) < 2 <= min(exposures.shape):
-        return f"{result}, since they lie on one line: move the sensor along the other axis too"
+    if cause := _uncompared(exposures):
+        return f"{result}, since {cause}"
     if _mask_separates(exposures):
         return f"{result}, since pixels between them are masked or missing: use shorter shifts"
     return f"{result}: choose other shifts, see equipix.plan.identify"
+
+
+def _uncompared(exposures: Exposures) -> str | None:
+    """Say why positions do not compare pixels along both axes, and the remedy; None where they do.
+
+    Measured positions of one line scatter about it.
+    """
+    shifts, turned = exposures.positions.shifts, exposures.positions.are_turned
+    if not np.ptp(shifts, axis=0).any() and not turned:
+        return "they are all alike: move the sensor between exposures"
+    if len(exposures) < _FEWEST:
+        return (
+            f"{len(exposures)} exposures compare pixels along one direction only: take "
+            f"at least {_FEWEST}, at positions that do not lie on one line"
+        )
+    rank = np.linalg.matrix_rank(shifts - shifts[0], _OFF_LINE)
+    if not turned and rank < 2 <= min(exposures.shape):
+        return "they lie on one line: move the sensor along the other axis too"
+    return None
 
 
 def _mask_separates(exposures: Exposures) -> bool:

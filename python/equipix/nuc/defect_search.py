@@ -37,11 +37,7 @@ def mean_slope(response: Response) -> Floats:
 
 
 def of_response(
-    response: Response,
-    slope: Floats,
-    limits: DefectLimits,
-    misfit: float,
-    filters: Filters | None,
+    response: Response, slope: Floats, limits: DefectLimits, misfit: float, filters: Filters | None
 ) -> dict[str, Bools]:
     """Bad pixels by their curves of this mean slope; `misfit` is that of the array.
 

@@ -168,12 +168,7 @@ class Response(CorrectionBase, Record, kind="response", version=2):
         return lambda frame: exact_inverse(rising, frame - zero, self.limits)
 
     @naming_memory("finding extrapolated values")
-    def extrapolated(
-        self,
-        frames: ArrayLike,
-        *,
-        dark: Dark = "stored",
-    ) -> Bools:
+    def extrapolated(self, frames: ArrayLike, *, dark: Dark = "stored") -> Bools:
         """Which values lie outside the range that the levels cover, so their correction is a guess.
 
         Parameters

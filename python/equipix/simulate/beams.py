@@ -122,7 +122,7 @@ def filtered(
     if missing:
         raise InputError(
             f"'cfa' has the colours {missing}, whose response is not known (known: "
-            f"{', '.join(known)}): give 'response'"
+            f"{', '.join(known)}): use these alone, or in Python give the response of each"
         )
     return np.asarray(plain * colours.map_of(known, plain.shape), np.float64)
 
