@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import bolometer, detector, errors, lens, metrics, nuc, simulate
+from equipix import bolometer, detector, errors, hardware, lens, metrics, nuc, scene, simulate
 from equipix.lens import cos4
 
 SHAPE = (24, 32)
@@ -142,6 +142,54 @@ def test_is_refused_by_the_name_of_the_argument(function, wrong):
 def test_messages_say_what_is_wanted(call, message):
     with pytest.raises(errors.InputError, match=message):
         call()
+
+
+FRAMES_OF = {
+    "calibrate": ("frames", lambda given: equipix.calibrate(given, equipix.cross_pattern(3, 5))),
+    "nuc.fit": ("levels", nuc.fit),
+    "bolometer.fit": ("shutter", lambda given: bolometer.fit(given, CELSIUS, bias_v=2.0)),
+    "find_defects": ("frames", lambda given: nuc.find_defects(RESPONSE, given)),
+    "correct": ("frames", RESPONSE.correct),
+    "Corrector": ("frames", equipix.Corrector(RESPONSE).apply),
+    "lens.fit": ("frame", lens.fit),
+    "scene": ("frame", scene.LocalMean(SHAPE, (0, 1)).update),
+    "three_d_noise": ("frames", metrics.three_d_noise),
+}
+
+
+@pytest.mark.parametrize("call", FRAMES_OF)
+@pytest.mark.parametrize(
+    "given", [RESPONSE, lens.fit(FLAT), scene.LocalMean(SHAPE, (0, 1))], ids=type
+)
+def test_a_result_in_the_place_of_frames_is_named(call, given):
+    name, take = FRAMES_OF[call]
+    kind = f"of type {type(given).__name__}, expected an array of numbers$"
+    with pytest.raises(errors.InputError, match=f"'{name}' is {kind}"):
+        take(given)
+    with pytest.raises(errors.InputError, match=f"'{name}' holds a value {kind}"):
+        take([given] * 5)
+
+
+@pytest.mark.parametrize("call", sorted(FRAMES_OF.keys() - {"nuc.fit"}))  # names equipix.average
+def test_a_generator_in_the_place_of_frames_is_named(call):
+    name, take = FRAMES_OF[call]
+    with pytest.raises(errors.InputError, match=f"'{name}' is of type generator.* make a list of"):
+        take(each for each in STACKS)
+
+
+@pytest.mark.parametrize("call", sorted(FRAMES_OF.keys() - {"find_defects"}))  # takes it
+def test_one_average_in_the_place_of_frames_is_named(call):
+    name, take = FRAMES_OF[call]
+    remedy = "give its 'mean'|one FrameStatistics, expected a list: one for each"
+    with pytest.raises(errors.InputError, match=f"'{name}' is .*({remedy})"):
+        take(LEVELS[0])
+
+
+def test_only_a_response_is_inverted_exactly():
+    assert RESPONSE.correct(STACKS[1], exact=True).shape == STACKS[1].shape
+    for correction in (GAIN, hardware.Table.of(RESPONSE)):
+        with pytest.raises(errors.InputError, match="'exact' is True, but only a Response has"):
+            correction.correct(STACKS[1], exact=True)
 
 
 def test_the_largest_number_of_flags_is_taken():

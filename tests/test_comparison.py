@@ -168,8 +168,9 @@ def test_bad_arguments_are_named(experiments):
         equipix.compare(calibrations, predicted=np.ones((2, 2)))
     with pytest.raises(errors.InputError, match=r"'predicted' has shape \(3, 1\)"):
         equipix.compare(calibrations, predicted=np.ones((3, 1)))
-    frames = np.ones((5, 40, 50))
-    small = equipix.calibrate(frames, equipix.cross_pattern(5, 7))
+    shape, shifts = (40, 50), equipix.cross_pattern(5, 7)
+    frames = simulate.exposures(np.ones(shape), simulate.gaussian_beam(shape), shifts)
+    small = equipix.calibrate(frames, shifts)
     with pytest.raises(errors.InputError, match="expected one shape"):
         equipix.compare([small, calibrations[0]])
     no_good = type(small)(**(vars(small) | {"flags": small.flags | 1}))

@@ -8,14 +8,18 @@ A folder's own file, ``joint.rs``, uses the files in the folder. A file in there
 of the folder's own file therefore closes a circle. SHARED names the items that files of a folder
 nevertheless take from the folder's own file; a use of any other item of it is a circle.
 
-The rules of the Python package stand in pyproject.toml, for import-linter.
+The rules of the Python package stand in pyproject.toml, for import-linter. Here stands what its
+contracts cannot say: that no library is named that they do not name, and that no file of the
+package imports the package itself, which hides the folder that is used.
 """
 
 from __future__ import annotations
 
+import sys
 import tomllib
 from pathlib import Path
 
+import grimp
 import pytest
 
 from import_graph import circle, name_of, rust_crates, rust_graph, rust_items, rust_sources
@@ -71,6 +75,11 @@ CRATES = {
     "tiff": {"io"},
 }
 """The core modules that alone may name a crate."""
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+CONTRACTS = PROJECT["tool"]["importlinter"]["contracts"]
+LIBRARIES = {"numpy"}.union(*(each.get("protected_modules", ()) for each in CONTRACTS))
+"""The libraries of the Python package: each but NumPy is named in one place, by a contract."""
 
 RUST = rust_sources(CORE)
 CORE_FILES = sorted(name_of(place) for place in RUST if place)
@@ -169,3 +178,58 @@ def test_the_checker_passes_what_is_allowed():
 def test_the_checker_finds_modules_without_a_place():
     with pytest.raises(AssertionError, match="'extra' stands nowhere"):
         rust_faults("extra", "")
+
+
+def python_faults(package):
+    """Libraries without a contract, and imports of the package itself, in its files.
+
+    The compiled part is no Python file, so that it counts as the package itself.
+    """
+    graph = grimp.build_graph(
+        package,
+        include_external_packages=True,
+        exclude_type_checking_imports=False,
+        cache_dir=None,
+    )
+    outside = {name for name in graph.modules if graph.is_module_squashed(name)}
+    hidden = [
+        details["line_contents"]
+        for name in graph.find_modules_that_directly_import(package)
+        for details in graph.get_import_details(importer=name, imported=package)
+    ]
+    compiled = (f"from {package} import _native", f"from {package}._native import ")
+    faults = outside - sys.stdlib_module_names - LIBRARIES
+    return faults | {line for line in hidden if not line.startswith(compiled)}
+
+
+def test_python_files_name_known_libraries_and_the_modules_that_they_use():
+    assert python_faults("equipix") == set()
+
+
+def test_every_library_is_a_dependency():
+    project = PROJECT["project"]
+    wanted = [*project["dependencies"], *project["optional-dependencies"]["plot"]]
+    declared = {each.split(">")[0] for each in wanted}
+    # pydantic's own compiled part comes with it.
+    assert LIBRARIES - sys.stdlib_module_names - {"pydantic_core"} == declared
+
+
+@pytest.mark.parametrize(
+    ("source", "faults"),
+    [
+        ("import scipy.ndimage", {"scipy"}),
+        ("def f():\n    from PIL import Image", {"PIL"}),
+        ("import typing\nif typing.TYPE_CHECKING:\n    import pandas", {"pandas"}),
+        ("from sample import b", set()),
+        ("from sample import X", {"from sample import X"}),
+        ("import sample", {"import sample"}),
+        ("from . import X", {"from . import X"}),
+        ("from sample import _native\nfrom sample._native import Fit\nimport numpy", set()),
+    ],
+)
+def test_the_checker_finds_hidden_imports(tmp_path, monkeypatch, source, faults):
+    (tmp_path / "sample").mkdir()
+    for name, text in {"__init__": "", "a": source, "b": "import json"}.items():
+        (tmp_path / f"sample/{name}.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert python_faults("sample") == faults

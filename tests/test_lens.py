@@ -229,7 +229,7 @@ class TestCombine:
         assert spread[0] > 0.05
         # Noise of 1e-4 is up to 1e-3 where the source was faint, and so is the tilt that it leaves.
         assert spread[1] < 5e-3
-        assert set(both.metadata) == {"first", "then"}
+        assert set(both.metadata) == {"versions", "first", "then", "finished"}
 
     def test_a_dark_is_not_subtracted_twice(self):
         shifts = equipix.cross_pattern(5, 7)
@@ -292,7 +292,7 @@ class TestCombine:
             with pytest.raises(errors.InputError, match="'then' holds the offsets of raw levels"):
                 equipix.combine(falloff, then)
         learned = equipix.scene.ConstantStatistics(SHAPE, (0.0, 1.0))
-        for each in simulate.MovingScene(seed=1, shape=SHAPE).frames(5):
+        for each in simulate.MovingScene(seed=1, shape=SHAPE).frames(40):
             learned.update(each.values)
         learned.correction().save(tmp_path / "scene.npz")
         for then in (learned.correction(), equipix.load(tmp_path / "scene.npz")):

@@ -304,6 +304,24 @@ def test_quality_holds_one_stack_of_corrected_frames(tmp_path, filters):
     assert peak < 3 * frames.nbytes
 
 
+@pytest.mark.parametrize("dark", [None, 5.0], ids=["no dark", "dark"])
+def test_coefficients_are_made_in_the_precision_of_the_frames(dark):
+    """Of 4 bytes, beside one map or two of 8: all coefficients of 8 bytes took 8 maps of 4."""
+    shape = (200, 300)
+    truth = equipix.simulate.paper_sensitivity(shape, rng=1)
+    frames = equipix.simulate.exposures(truth, equipix.simulate.gaussian_beam(shape), CROSS)
+    cal = equipix.calibrate(frames, CROSS, tolerance=1e-2)
+    frame, offset = frames[0].astype(np.float32), None if dark is None else np.full(shape, dark)
+    out = np.empty_like(frame)
+    tracemalloc.start()
+    try:
+        cal.correct(frame, dark=offset, out=out)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < (5 if dark is None else 7) * frame.nbytes
+
+
 CORRECT = """
 from equipix import cli
 from equipix.cli.app import command

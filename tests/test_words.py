@@ -141,8 +141,8 @@ def test_files_that_their_names_belie(manifest, tmp_path, capsys):
         run("calibrate", manifest, "-o", tmp_path / "c.tif", "--mask", tmp_path / "mask.npy") == 1
     )
     said = capsys.readouterr().err
-    assert "cal.npz: cannot be read: File is not a zip file" in said
-    assert "mask.npy: is no .npy file" in said
+    assert "cal.npz: cannot be read: incomplete, damaged, or no .npz file: use a copy" in said
+    assert "mask.npy: cannot be read: incomplete, damaged, or no .npy file" in said
     assert "pickle" not in said
 
 
@@ -150,19 +150,40 @@ def test_inspect_names_the_file(tmp_path, capsys):
     (tmp_path / "cal.png").write_bytes(b"")
     assert run("inspect", tmp_path / "cal.png") == 1
     said = capsys.readouterr().err
-    assert "cal.png: ends in '.png', expected the suffix .tif or .npz" in said
+    assert (
+        "cal.png: ends in '.png', expected the suffix .tif, .tiff, .npz, .bin, .hex or .h" in said
+    )
     assert "'path'" not in said
     with pytest.raises(errors.InputError, match="ends in"):
         equipix.load(tmp_path / "mean.fits")
 
 
-def test_a_picture_is_no_folder_of_corrected_frames(manifest, tmp_path, capsys):
-    frames = manifest.parent / "frames/p0.tif"
-    assert run("correct", "cal.tif", frames, "-o", tmp_path / "x.jpg") == 1
-    assert (
-        "x.jpg' ends in '.jpg', but corrected frames are written as .tif" in capsys.readouterr().err
-    )
+@pytest.mark.parametrize("suffix", [".jpg", ".xyz", ".TOML"])
+def test_a_file_of_another_format_is_no_folder_of_corrected_frames(
+    manifest, tmp_path, capsys, suffix
+):
+    frames, output = manifest.parent / "frames/p0.tif", tmp_path / f"x{suffix}"
+    assert run("correct", "cal.tif", frames, "-o", output) == 1
+    words = f"x{suffix}' ends in '{suffix}', but corrected frames are written as .tif"
+    assert words in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_frames_go_to_a_folder_with_a_dot_in_its_name(manifest, tmp_path):
+    frames = manifest.parent / "frames/p0.tif"
+    flat = equipix.Polynomial(np.ones((2, *SHAPE)), np.zeros(SHAPE, np.uint32))
+    flat.save(tmp_path / "flat.npz")
+    output = tmp_path / "run.2"
+    output.mkdir()
+    assert run("correct", tmp_path / "flat.npz", frames, "-o", output, "--force") == 0
+    assert [each.name for each in output.iterdir()] == ["p0.tif"]
+
+
+def test_a_message_on_the_name_of_a_picture_has_usual_suffixes(tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+    assert run("compare", "one.tif", "two.tif", "-o", tmp_path / "x.txt") == 1
+    said = capsys.readouterr().err
+    assert said.endswith("x.txt' is no picture, expected a suffix such as .png, .pdf or .svg\n")
 
 
 def test_an_undetermined_tilt_is_said_in_words(tmp_path, capsys):

@@ -135,7 +135,7 @@ def as_array(name: str, values: ArrayLike, *, ndim: int | tuple[int, ...]) -> ND
     except (TypeError, ValueError) as error:
         raise InputError(f"'{name}' is not an array of numbers: {error}") from error
     if array.dtype.kind not in "buif":
-        raise InputError(f"'{name}' has dtype {array.dtype}, expected real numbers")
+        raise InputError(f"'{name}' {_in_place_of_numbers(array)}")
     ranks = (ndim,) if isinstance(ndim, int) else ndim
     if array.ndim not in ranks:
         wanted = " or ".join(str(rank) for rank in ranks)
@@ -143,6 +143,18 @@ def as_array(name: str, values: ArrayLike, *, ndim: int | tuple[int, ...]) -> ND
             f"'{name}' has shape {array.shape}, expected {wanted} dimensions, not {array.ndim}"
         )
     return np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("="))
+
+
+def _in_place_of_numbers(array: Array) -> str:
+    """Say what an array holds in place of real numbers, and what to give of it."""
+    objects = array.flat if array.dtype == object else ()
+    for each in objects:
+        if not isinstance(each, int | float | np.number):
+            verb = "holds a value" if array.ndim else "is"
+            remedy = ": make a list of it" if hasattr(each, "__next__") else ""
+            remedy = ": give its 'mean'" if hasattr(each, "mean") else remedy
+            return f"{verb} of type {type(each).__name__}, expected an array of numbers{remedy}"
+    return f"has dtype {array.dtype}, expected real numbers"
 
 
 def as_floats(name: str, values: ArrayLike, *, ndim: int | tuple[int, ...]) -> NDArray[Any]:
@@ -350,10 +362,14 @@ def as_mask(
 
 
 class Words(NamedTuple):
-    """What messages call the argument of the measurements, and one of them."""
+    """What messages call the argument of the measurements, and one of them.
+
+    `pixel_variances` is whether they take a variance of each pixel.
+    """
 
     argument: str = "'frames'"
     one: str = "exposure"
+    pixel_variances: bool = True
 
     def place(self, number: int, name: str = "") -> str:
         """Name one of the measurements."""

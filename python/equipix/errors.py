@@ -27,8 +27,21 @@ class SpotError(InputError):
     """A spot is missing, cut by the edge, doubled or saturated."""
 
 
+_REMEDIES = {
+    "is truncated": "copy it again, or record it again",
+    "signature not found": "use a file of the format that its name says",
+    "one grey channel": "record grey, or write a stack by tifffile with photometric='minisblack'",
+}
+"""What to do about a file, by the last words of what its reader says."""
+
+
 class FileError(EquipixError, OSError):
     """A file cannot be read or written, or holds something else; the message names it."""
+
+    def __str__(self) -> str:
+        """Return the message, with a remedy where the reader of the file gave none."""
+        said = super().__str__()
+        return ": ".join([said, *(_REMEDIES[end] for end in _REMEDIES if said.endswith(end))])
 
 
 class UnsupportedFileError(FileError):

@@ -53,6 +53,9 @@ class Finding:
     severity: Severity = "warning"
 
 
+Findings = tuple[Finding, ...]
+
+
 @dataclass(frozen=True)
 class Rule(Generic[_Evidence]):
     """A question that may give a finding: an entry in a table of them.

@@ -11,6 +11,7 @@ from equipix._check import Bools, Floats, ReadOnly, as_array, as_mask, check_sha
 from equipix.correction.polynomial import Polynomial
 from equipix.errors import InputError
 from equipix.findings import set_bits
+from equipix.io.record import made
 from equipix.measured.colour import Colours, responses
 from equipix.measured.noise import ROBUST
 from equipix.metrics.maps import block_means
@@ -94,7 +95,7 @@ class LensFalloff(ReadOnly):
         """
         light = self.illumination()
         unknown = ~(light > _LEAST)
-        metadata: dict[str, Any] = {"law": self.law, "centre": list(self.centre)}
+        metadata = made(law=self.law, centre=list(self.centre))
         if self.law == "cos4":
             metadata["focal_length"] = self.focal_length
         else:

@@ -60,9 +60,7 @@ def check_picture(path: Path | None) -> None:
         return
     formats = new_figure(1, 1).canvas.get_supported_filetypes()
     if path.suffix.lower().removeprefix(".") not in formats:
-        raise InputError(
-            f"'{path}' is not the name of a picture, expected the suffix {' or '.join(formats)}"
-        )
+        raise InputError(f"'{path}' is no picture, expected a suffix such as .png, .pdf or .svg")
 
 
 def save_figure(figure: Figure, path: Path, *, force: bool = False) -> None:

@@ -3,13 +3,13 @@
 from os import PathLike
 from typing import Any
 
-from equipix._check import described
 from equipix.bolometer.dynamic import DynamicCorrection
 from equipix.calibration.result import Calibration
 from equipix.correction.polynomial import Polynomial
 from equipix.correction.protocol import Correction
-from equipix.errors import FileError
-from equipix.hardware.table import SUFFIXES, read_table
+from equipix.errors import FileError, InputError
+from equipix.hardware import table
+from equipix.io import formats
 from equipix.io.paths import as_path
 from equipix.io.record import read_record
 from equipix.measured.statistics import FrameStatistics
@@ -19,12 +19,17 @@ from equipix.scene.scene_correction import SceneCorrection, SceneState
 
 RECORDS = (Calibration, DynamicCorrection, FrameStatistics, Polynomial, Response, SceneState)
 
+SUFFIXES = (*formats.SUFFIXES, *table.SUFFIXES)
+
+READ = f"{', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}"
+"""Suffixes of what is read, in words."""
+
 _NO_CORRECTIONS = (
-    (DynamicCorrection, "its correction(...) is that of a state: save that"),
-    (FrameStatistics, "equipix correct subtracts them as --dark"),
-    (SceneCorrection, "its correction() is a correction: save that"),
+    (DynamicCorrection, "a dynamic correction", "save its correction(...) of a state"),
+    (FrameStatistics, "frame statistics", "equipix correct subtracts them as --dark"),
+    (SceneCorrection, "the state of a scene correction", "save its correction(), equipix scene -o"),
 )
-"""What is no correction, and what can be done with it."""
+"""What is no correction, what a file of it holds, and what can be done with it."""
 
 
 def load(path: str | PathLike[str]) -> Any:
@@ -33,12 +38,14 @@ def load(path: str | PathLike[str]) -> Any:
     Parameters
     ----------
     path : str or path
-        The file; its suffix names the format: .tif or .npz, of a table of words .bin, .hex or .h.
+        The file; its suffix names the format: .tif, .tiff or .npz, of a table of words .bin, .hex
+        or .h.
 
     Returns
     -------
     Calibration, FrameStatistics, Polynomial, or another class that has a ``save``
-        As it was saved, bit by bit. A correction from the scene goes on learning from there.
+        As it was saved, bit by bit. A correction from the scene goes on learning from there, with
+        all processors: `workers` is no part of its state, and changes no bit of a result.
 
     Raises
     ------
@@ -47,8 +54,11 @@ def load(path: str | PathLike[str]) -> Any:
     InputError
         If the suffix is another.
     """
-    if as_path("path", path).suffix.lower() in SUFFIXES:
-        return read_table(path)
+    suffix = as_path("path", path).suffix.lower()
+    if suffix not in SUFFIXES:
+        raise InputError(f"{path}: ends in '{suffix}', expected the suffix {READ}")
+    if suffix in table.SUFFIXES:
+        return table.read_table(path)
     found = read_record(path, *RECORDS)
     return resumed(path, found) if isinstance(found, SceneState) else found
 
@@ -59,8 +69,8 @@ def load_correction(path: str | PathLike[str]) -> Correction:
     The parameters and errors are those of `load`.
     """
     found = load(path)
-    for kind, words in _NO_CORRECTIONS:
+    for kind, held, words in _NO_CORRECTIONS:
         if isinstance(found, kind):
-            raise FileError(f"{path}: holds {described(found)}, expected a correction: {words}")
+            raise FileError(f"{path}: holds {held}, expected a correction: {words}")
     correction: Correction = found
     return correction

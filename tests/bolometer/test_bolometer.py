@@ -294,7 +294,7 @@ class TestFiles:
 
     def test_in_the_place_of_a_correction_it_says_how_to_get_one(self, both, tmp_path):
         both.save(tmp_path / "kept.tif")
-        with pytest.raises(errors.FileError, match="DynamicCorrection, expected a correction"):
+        with pytest.raises(errors.FileError, match="holds a dynamic correction, expected a corr"):
             load_correction(tmp_path / "kept.tif")
 
     def test_inspect_shows_it(self, both, tmp_path, run):

@@ -303,8 +303,9 @@ class TestUniformSource:
         given = ("nuc", "quality", tmp_path / "response.npz", tmp_path / "level.tif", "--json")
         status, out, _ = run(*given)
         found = json.loads(out)
-        assert (status, [*found]) == (0, ["R", "G1", "G2", "B"])
+        assert (status, [*found]) == (0, ["R", "G1", "G2", "B", "findings"])
         assert json.loads(run(*given, "--cfa", "RGGB")[1]) == found
+        assert found.pop("findings") == []
         status, _, err = run(*given, "--cfa", "BGGR")
         assert status == 1
         assert "--cfa is 'BGGR', but the correction was fitted with 'RGGB'" in err

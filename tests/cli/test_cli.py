@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import os
 import pty
@@ -17,6 +18,8 @@ import pytest
 
 import equipix
 from equipix import average, cli, simulate
+from equipix.cli import terminal
+from equipix.errors import FileError
 from equipix.io.frames import read_frames
 from equipix.io.tiff import write_frames
 
@@ -204,11 +207,38 @@ def test_average_writes_statistics(run, experiment, tmp_path):
         "--saturation", "4095", "--json",
     )  # fmt: skip
     assert status == 0
-    assert json.loads(out)["frames"] == 12
+    told = json.loads(out)
+    assert (told["frames"], told["findings"]) == (12, [])
     expected = average([frames / "p0.tif", frames / "p1.tif"], dark=average(dark), saturation=4095)
     saved = equipix.load(output)
     for name, values in expected.maps.items():
         np.testing.assert_array_equal(getattr(saved, name), values)
+    files = [str(each) for each in (frames / "p0.tif", frames / "p1.tif", dark)]
+    assert [*saved.metadata["inputs"]] == files
+    digest = hashlib.sha256(dark.read_bytes()).hexdigest()
+    assert saved.metadata["inputs"][files[-1]] == digest
+    # A saved average keeps its origin.
+    run("average", output, "-o", tmp_path / "again.tif")
+    again = equipix.load(tmp_path / "again.tif").metadata
+    assert {*again["inputs"]} == {*files, str(output)}
+    assert {name: again[name] for name in ("options", "started", "finished")} == {
+        "options": {"saturation": 4095, "reject": None},
+        "started": saved.metadata["started"],
+        "finished": saved.metadata["finished"],
+    }
+
+
+def test_what_an_average_does_not_determine_is_said_in_words(run, tmp_path):
+    frame = np.arange(20 * 24, dtype=np.float32).reshape(20, 24)
+    write_frames(tmp_path / "one.tif", iter([frame]), nbytes=1)
+    command = ("average", tmp_path / "one.tif", "-o", tmp_path / "mean.npz")
+    status, out, _ = run(*command)
+    assert status == 0
+    rows = dict(re.split("  +", line, maxsplit=1) for line in out.splitlines())
+    assert (rows["variance"], rows["saturation"]) == ("not determined", "none")
+    assert rows["findings"] == "none"
+    told = json.loads(run(*command, "--json", "--force")[1])
+    assert (told["variance"], told["saturation"]) == (None, None)
 
 
 def test_correct_to_one_file_and_to_a_folder(run, experiment, calibration, tmp_path):
@@ -226,6 +256,21 @@ def test_correct_to_one_file_and_to_a_folder(run, experiment, calibration, tmp_p
     np.testing.assert_array_equal(read_frames(folder / "p1.tif"), expected[6:])
 
 
+def test_json_has_null_for_numbers_that_do_not_exist(capsys):
+    values = {
+        "a": float("nan"),
+        "b": [1.5, [np.float64("inf")]],
+        "c": ({"d": -np.inf},),
+        "e": "nan",
+    }
+    terminal.show_result(values, as_json=True)
+    out = capsys.readouterr().out
+    assert json.loads(out) == {"a": None, "b": [1.5, [None]], "c": [{"d": None}], "e": "nan"}
+    terminal.show_result({"a": np.inf, "b": [1.5, np.nan], "nan": "nan.tif"}, as_json=False)
+    said = [line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()]
+    assert said == [["a", "not determined"], ["b", "1.5, not determined"], ["nan", "nan.tif"]]
+
+
 @pytest.mark.parametrize("folder", [False, True])
 def test_correct_warns_of_corrected_frames(run, experiment, calibration, tmp_path, folder):
     inputs = [experiment.parent / f"frames/p{k}.tif" for k in range(2)]
@@ -233,11 +278,21 @@ def test_correct_warns_of_corrected_frames(run, experiment, calibration, tmp_pat
     status, _, err = run("correct", calibration, *inputs, "-o", once)
     assert (status, err) == (0, "")
     corrected = sorted(once.iterdir()) if folder else [once]
-    status, _, err = run("correct", calibration, *corrected, "-o", twice)
-    assert status == 0
+    status, out, err = run("correct", calibration, *corrected, "-o", twice, "--json")
+    assert (status, [each["kind"] for each in json.loads(out)["findings"]]) == (0, ["corrected"])
     more = " and 1 more" if folder else ""
     assert err.startswith(f"equipix: warning: {corrected[0]}{more}: corrected already")
     assert err.count("\n") == 1
+
+
+def test_correct_refuses_an_input_that_is_named_twice(run, experiment, calibration, tmp_path):
+    raw = tmp_path / "p0.tif"
+    raw.write_bytes((experiment.parent / "frames/p0.tif").read_bytes())
+    (tmp_path / "link.tif").symlink_to(raw)
+    for again in (raw, tmp_path / "*.tif", tmp_path / "link.tif"):
+        for output in (tmp_path / "out.tif", tmp_path / "out"):
+            refused(run("correct", calibration, raw, again, "-o", output), "named twice")
+            assert not output.exists()
 
 
 def test_correct_takes_another_dark(run, experiment, calibration, tmp_path):
@@ -252,6 +307,16 @@ def test_correct_takes_another_dark(run, experiment, calibration, tmp_path):
     plain, dark_subtracted, mean_subtracted = corrected
     np.testing.assert_array_equal(mean_subtracted, dark_subtracted)
     assert np.nanmean(plain - dark_subtracted) == pytest.approx(60, abs=10)
+
+
+def test_all_colour_filters_of_the_help_can_be_simulated(run, tmp_path):
+    said = terminal.Cfa.__metadata__[0].help
+    patterns = re.findall(r"\b[A-Z]{2,}(?:/[A-Z]+)*/?", said)
+    assert len(patterns) == 6
+    for k, cfa in enumerate(patterns):
+        command = ("simulate", "-o", tmp_path / str(k), "--shape", 48, 64, "--frames", 1)
+        assert run(*command, "--cfa", cfa)[0] == 0
+    refused(run(*command, "--force", "--cfa", "RGBW/"), "the colours ['W']", "use these alone")
 
 
 def test_simulate_writes_an_experiment(run, tmp_path):
@@ -387,6 +452,47 @@ def test_an_input_is_never_replaced(run, experiment, calibration, tmp_path):
     assert raw.read_bytes() == content
 
 
+def test_files_that_cannot_be_read_say_what_to_do(run, experiment, calibration, tmp_path):
+    frames, output = experiment.parent / "frames/p0.tif", tmp_path / "mean.tif"
+    table = tmp_path / "table.bin"
+    assert run("hardware", calibration, "-o", table)[0] == 0
+    for name, content, words in (
+        ("cut.tif", frames.read_bytes()[:9999], "is truncated: copy it again"),
+        ("cal.tif", calibration.read_bytes()[:9999], "damaged, or no .tif file: use a copy"),
+        ("no.npz", b"hello", "damaged, or no .npz file: use a copy"),
+        ("word.tif", b"hello", "use a"),
+        ("latin.toml", "format = 1\n# caf\xe9".encode("latin-1"), "line 2 is no UTF-8: save it"),
+        ("table.h", table.read_bytes(), "damaged, or no .h file: use a copy"),
+        ("table.hex", table.read_bytes(), "damaged, or no .hex file: use a copy"),
+        ("text.bin", b"hello", "written in the format of its name: name such a file"),
+    ):
+        path = tmp_path / name
+        path.write_bytes(content)
+        command = "calibrate" if name == "latin.toml" else "inspect"
+        command = "average" if name in ("cut.tif", "word.tif") else command
+        result = run(command, path, *(() if command == "inspect" else ("-o", output)))
+        refused(result, f"{path}: ", words)
+        assert not re.search("codec|zip|Errno|byte 0x|expected str", result[2])
+    for name in ("nosuch.bin", "nosuch.h", "nosuch.npz", "nosuch.tif"):
+        refused(run("inspect", tmp_path / name), f"{name}: does not exist")
+
+
+def test_an_output_that_no_folder_takes_is_named_alone(run, experiment):
+    result = run("average", experiment.parent / "frames/p0.tif", "-o", "/proc/x.tif")
+    refused(result, "/proc/x.tif", "cannot be written: ")
+    assert result[2].count(".tif") == 1
+    with pytest.raises(FileError, match="^/proc/x.npz: cannot be written: [^/]*: name another fol"):
+        average(np.zeros((2, 3, 4))).save("/proc/x.npz")
+
+
+def test_results_are_no_masks(run, experiment, calibration, tmp_path):
+    frames, average = experiment.parent / "frames/p0.tif", tmp_path / "mean.npz"
+    assert run("average", frames, "-o", average)[0] == 0
+    for mask, kind in ((calibration, "a calibration"), (average, "frame statistics")):
+        result = run("average", frames, "--mask", mask, "-o", tmp_path / "a.tif")
+        refused(result, f"{mask}: holds {kind}, expected a mask, ")
+
+
 def test_a_failed_job_leaves_nothing(run, experiment, calibration, tmp_path):
     truncated = tmp_path / "truncated.tif"
     truncated.write_bytes((experiment.parent / "frames/p0.tif").read_bytes()[:999])
@@ -503,6 +609,13 @@ class TestPlan:
         assert found["equations"] == 5 * 64 * 80
         assert sorted(found["order"]) == [0, 1, 2, 3, 4]
 
+    def test_an_option_without_effect_is_a_finding(self, run):
+        command = ("plan", "--shape", 64, 80, "--shifts", self.CROSS, "--shift-error", 0.1)
+        _, out, err = run(*command, "--json")
+        (found,) = json.loads(out)["patterns"]
+        assert found["findings"][0]["kind"] == "unused"
+        assert found["findings"][0]["message"] in err
+
     def test_finds_patterns(self, run):
         status, out, _ = run("plan", "--shape", 64, 80, "--max-shift", 9, 9, "--drift", 0, "--json")
         assert status == 0
@@ -535,6 +648,34 @@ class TestPlan:
         assert (status, err) == (0, "")
         assert json.loads(out)["patterns"][0]["components"] == 1
 
+    @pytest.mark.parametrize("shifts", ["0,0 0,0 0,1", "0,0 0,5 0,7", "0,0 0,5.3 0,7.8"])
+    def test_what_a_line_of_shifts_leaves_open_is_said(self, run, shifts):
+        command = ("plan", "--shape", 50, 50, "--shifts", shifts)
+        status, out, err = run(*command, "--json")
+        assert status == 0
+        assert not re.search("NaN|Infinity", out)
+        (found,) = json.loads(out)["patterns"]
+        assert found["rms"] is None
+        assert found["rms_by_cause"]["drift"] is None
+        assert found["tilt_by_cause"]["drift"][0] is None
+        assert found["tilt_by_cause"]["drift"][1] > 0
+        kind = "tilt" if "." in shifts else "components"
+        assert kind in [each["kind"] for each in found["findings"]]
+        assert "unconnected" in err or "the shifts lie on one line" in err
+        assert "equipix.plan" not in err
+        status, out, err = run(*command)
+        assert status == 0
+        assert re.search(r"all causes +not determined", out)
+        assert not re.search(r"\b(inf|nan)\b", out + err)
+
+    def test_a_beam_that_lights_a_part_is_named_with_the_width_that_suffices(self, run):
+        command = ("plan", "--shape", 100, 100, "--shifts", "0,0 0,11 0,19 11,0 19,0")
+        status, _, err = run(*command, "--beam-width", 5)
+        assert status == 0
+        share, width = re.search(r"for (\S+)% of the pixels.* --beam-width (\d+) or", err).groups()
+        assert float(share) > 50
+        assert run(*command, "--beam-width", width, "--drift", 0)[2] == ""
+
     @pytest.mark.parametrize(
         ("arguments", "words"),
         [
@@ -555,7 +696,33 @@ def test_frames_of_different_things_are_noticed_in_an_average(run, tmp_path):
         frames = np.rint(level + 3 * rng.standard_normal((4, 20, 24))).astype(np.uint16)
         write_frames(tmp_path / f"{name}.tif", iter(frames), nbytes=frames.nbytes)
     for source, words in (("light.tif", ""), ("*.tif", "see that all are of one measurement")):
-        status, _, said = run("average", tmp_path / source, "-o", tmp_path / f"out{len(words)}.npz")
+        output = tmp_path / f"out{len(words)}.npz"
+        status, out, said = run("average", tmp_path / source, "-o", output, "--json")
         assert status == 0
         assert words in said
         assert bool(words) == bool(said)
+        found = [dataclasses.asdict(each) for each in equipix.load(output).findings]
+        assert [words in each["message"] for each in found] == [True] * bool(words)
+        for shown in (out, run("inspect", output, "--json")[1]):
+            assert json.loads(shown)["findings"] == found
+
+
+@pytest.mark.parametrize(("rows", "says"), [(10, False), (9, True)])
+def test_an_average_that_saturates_in_most_pixels_is_noticed(run, tmp_path, rows, says):
+    frames = np.full((4, 20, 24), 2000, np.uint16)
+    frames[:, :rows] = 500
+    write_frames(tmp_path / "raw.tif", iter(frames), nbytes=frames.nbytes)
+    arguments = ("average", tmp_path / "raw.tif", "-o", tmp_path / "out.npz", "--saturation", 1000)
+    status, _, said = run(*arguments)
+    assert status == 0
+    words = "264 of 480 unmasked pixels (limit 50%) reach the saturation level of 1000.0 DN: expose"
+    assert (words in said) == says
+    assert bool(said) == says
+
+
+def test_an_average_of_frames_without_a_number_is_refused(run, tmp_path):
+    frames = np.full((4, 20, 24), np.nan, np.float32)
+    write_frames(tmp_path / "raw.tif", iter(frames), nbytes=frames.nbytes)
+    out = tmp_path / "out.npz"
+    refused(run("average", tmp_path / "raw.tif", "-o", out), "'frames' holds no finite number")
+    assert not out.exists()

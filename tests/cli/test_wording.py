@@ -95,12 +95,32 @@ def test_no_message_names_a_keyword_beside_its_option(called):
         ("nuc", "use order='auto', and see by='gain'", "use --order auto, and see --by gain"),
         ("simulate", "exists; force=True (--force) replaces", "exists; --force replaces"),
         ("inspect", "or use robust=True", "or use robust=True"),
+        ("scene", "Give data_range=(0, 4095), on", "Give --data-range 0 4095, on"),
+        ("average", "'workers' is 0, expected 1 to 9 or None", "--workers is 0, expected 1 to 9"),
+        ("average", "is 0, expected a level in DN, or None", "is 0, expected a level in DN"),
+        ("plan", "other shifts (equipix.plan.suggest)", "other shifts (equipix plan)"),
+        ("calibrate", "see equipix.plan.identify", "see equipix plan"),
+        ("calibrate", "shifts of equipix.plan.suggest(..., cfa=...)", "shifts of equipix plan"),
+        ("nuc", "give 'dark' to equipix.average.", "give 'dark' to equipix average."),
+        ("calibrate", "first (equipix.nuc.fit), or", "first (equipix nuc fit), or"),
+        ("inspect", "equipix.average.tif: is empty", "equipix.average.tif: is empty"),
+        ("calibrate", "'shifts' of exposure 2 is", "'shift' of exposure 2 is"),
+        ("plan", "'shifts' has shape (2,)", "--shifts has shape (2,)"),
+        ("nuc", "'response' (--response-limit) is 0", "--response-limit is 0"),
         ("calibrate", "/data/flux_std.csv: holds 3", "/data/flux_std.csv: holds 3"),
         ("calibrate", "/max_sweeps/a.tif: is empty", "/max_sweeps/a.tif: is empty"),
     ],
 )
 def test_forms_of_a_keyword(name, message, said):
     assert in_options(message, command(name)) == said
+
+
+def test_limits_of_bad_pixels_are_options(tmp_path, capsys):
+    names = ("response", "gain", "noise", "correlation", "range", "misfit")
+    for name in names:
+        with pytest.raises(SystemExit):
+            cli.main(["nuc", "defects", str(tmp_path / "r.tif"), f"--{name}-limit", "-1"])
+        assert capsys.readouterr().err.startswith(f"equipix: error: --{name}-limit is -1.0, ")
 
 
 def test_the_command_line_says_options(tmp_path, capsys):

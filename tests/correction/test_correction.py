@@ -16,7 +16,7 @@ import pytest
 
 import equipix
 from equipix import Flag, bolometer, hardware, lens, nuc, saved_results, scene, simulate
-from equipix.correction.apply import apply
+from equipix.correction.apply import CorrectionBase
 from equipix.correction.correct_files import correct_files
 from equipix.correction.protocol import MEMBERS, check_correction
 from equipix.errors import FileError, InputError
@@ -33,7 +33,7 @@ RNG = np.random.default_rng(5)
 
 
 @dataclass(frozen=True, eq=False)
-class Bent(Record, kind="bent response", version=2):
+class Bent(CorrectionBase, Record, kind="bent response", version=2):
     """A correction of second order whose offset is part of it: no dark frame, no sensitivity."""
 
     coefficients: Annotated[np.ndarray, "float32", "3 rows cols"]
@@ -48,13 +48,10 @@ class Bent(Record, kind="bent response", version=2):
     def shape(self):
         return self.flags.shape
 
-    def correct(self, frames, *, dark="stored", flagged="nan", out=None):
-        def formula(frame):
-            return np.polynomial.polynomial.polyval(
-                frame.astype(np.float64), self.coefficients, tensor=False
-            )
-
-        return apply(self, frames, dark, flagged, out, formula)
+    def _formula(self, _dark, _exact, /):
+        return lambda frame: np.polynomial.polynomial.polyval(
+            frame.astype(np.float64), self.coefficients, tensor=False
+        )
 
 
 @pytest.fixture
@@ -361,7 +358,7 @@ class TestLoad:
 
     def test_says_what_frame_statistics_are_where_they_are_no_correction(self, tmp_path):
         equipix.average(raw_frames()).save(tmp_path / "mean.tif")
-        with pytest.raises(FileError, match="holds .*FrameStatistics, expected a corr.*--dark"):
+        with pytest.raises(FileError, match="holds frame statistics, expected a corr.*--dark"):
             load_correction(tmp_path / "mean.tif")
 
     def test_names_the_kind_of_a_damaged_file(self, bent, tmp_path):

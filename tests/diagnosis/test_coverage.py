@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import re
+import warnings
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from equipix.cli.summary import summary
 
 import equipix
 from equipix import cli, errors, simulate
+from equipix.cli import terminal
 from equipix.diagnosis import coverage
+from equipix.exposures.exposures import Exposures
+from equipix.exposures.flux import Flux
+from equipix.exposures.positions import Positions
+from equipix.measured.measured import measured_of
 from given import written_experiment
 
 SHAPE, CROSS = (40, 50), equipix.cross_pattern(5, 7)
@@ -60,6 +68,38 @@ def test_the_cause_is_named(shifts, options, cause):
         found = equipix.calibrate(exposures(shifts), shifts, **options)
     assert found.is_partial
     assert [each.kind for each in found.findings].count("components") == 0
+
+
+@pytest.mark.parametrize(
+    ("shifts", "cause", "components"),
+    [
+        ([(0, 0), (0.3, 11.4)], "2 exposures .* take at least 3, .* not lie on one line", None),
+        ([(0, 0), (0, 11.3), (0, 18.6)], "they lie on one line: move the sensor along", SHAPE[0]),
+    ],
+    ids=["two", "line"],
+)
+def test_positions_between_pixels_are_a_cause_before_the_light(shifts, cause, components, capsys):
+    with warnings.catch_warnings(record=True, action="always") as said:
+        found = equipix.calibrate(exposures(shifts), shifts)
+    assert found.is_partial
+    messages = {each.message.kind: str(each.message) for each in said}
+    for kind in ("partial", "convergence"):
+        assert re.search(rf"do not determine the sensitivity, since {cause}", messages[kind])
+        assert "light" not in messages[kind]
+    told = summary(found)
+    terminal.show_result(told, as_json=True)
+    assert json.loads(capsys.readouterr().out)["components"] == components
+    terminal.show_result(told, as_json=False)
+    out = capsys.readouterr().out
+    assert re.search(rf"^components +{components or 'not determined'}$", out, re.MULTILINE)
+
+
+def test_positions_that_scatter_about_a_line_lie_on_it():
+    taken = measured_of(exposures([(0, 0)] * 4))
+    flux = Flux.of(None, None, None, 4)
+    for away, words in ((0.03, "they lie on one line"), (1.0, "the light is too weak")):
+        places = np.array([(0, 0), (away, 11.3), (-away, 18.6), (away, 24.2)])
+        assert words in coverage.why_weak(Exposures.of(taken, Positions.of(places), flux))
 
 
 def test_bad_pixels_are_a_cause():
@@ -150,7 +190,9 @@ def test_a_fit_far_from_its_minimum_is_written_only_if_asked(manifest, tmp_path,
 )
 def test_measurements_left_out_add_a_remedy_to_a_fit_far_from_its_minimum(ended, remedy):
     fit = SimpleNamespace(ended=ended, error_estimate=np.array([2.0]), lost=[])
-    evidence = SimpleNamespace(fit=fit)
+    measured, flux = measured_of(exposures(CROSS)), Flux.of(None, None, None, len(CROSS))
+    taken = Exposures.of(measured, Positions.of(CROSS), flux)
+    evidence = SimpleNamespace(fit=fit, exposures=taken)
     plain = coverage.too_far(evidence)
     assert remedy in plain
     fit.lost = [[3], [1, 4]]

@@ -32,8 +32,16 @@ def test_the_first_pair_is_named():
     assert repeated(frames, positions) is None
 
 
-def test_constants_may_repeat():
-    assert repeated(np.ones((5, 4, 6)), Positions.of(CROSS)) is None
+def test_equal_constants_are_named_and_missing_exposures_are_not():
+    positions = Positions.of(CROSS)
+    assert repeated(np.ones((5, 4, 6)), positions) == (0, 1)
+    assert repeated(np.full((5, 4, 6), np.nan), positions) is None
+
+
+def test_a_calibration_of_equal_constant_frames_says_so():
+    with pytest.warns(errors.MisfitWarning, match="exposures 0 and 1 are equal, value for value"):
+        cal = equipix.calibrate(np.full((5, 24, 32), 1000.0), CROSS)
+    assert "repeated" in {finding.kind for finding in cal.findings}
 
 
 def test_a_calibration_says_so():

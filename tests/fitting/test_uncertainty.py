@@ -344,7 +344,7 @@ class TestWhatIsUndetermined:
         assert wanted < 0.2
 
     def test_measurements_that_leave_no_freedom_need_a_variance(self):
-        frames = np.ones((2, 4, 5))
+        frames = np.ones((2, 4, 5)) + np.array([0, 1e-3])[:, None, None]
         message = "'variance' is None and the residuals do not determine the noise"
         with (
             pytest.warns(IdentifiabilityWarning, match="the shifts leave 4 parts"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import shutil
@@ -14,6 +15,7 @@ import equipix
 import hardware as docs
 import reference
 from equipix import Flag, Polynomial, errors, hardware, nuc
+from equipix.findings import Finding
 from equipix.io.tiff import write_frames
 from equipix.simulate import StaringArray
 
@@ -390,7 +392,7 @@ def test_memories_of_a_binary_file_are_aligned(made, tmp_path, bits):
 def test_other_suffixes_are_refused(made, tmp_path):
     with pytest.raises(errors.InputError, match=r"ends in none of \.bin, \.hex, \.h"):
         hardware.Table.of(made[1]).save(tmp_path / "table.txt")
-    with pytest.raises(errors.FileError, match="cannot be read"):
+    with pytest.raises(errors.FileError, match=r"none\.bin: does not exist"):
         equipix.load(tmp_path / "none.bin")
 
 
@@ -544,6 +546,22 @@ def test_the_smallest_width_is_the_first_that_suffices():
     assert found.offset_bits == 8
     with pytest.raises(errors.InputError, match="gain_bits"):
         hardware.smallest_widths(response, docs.frames_of(array), gain_bits=9)
+
+
+def test_findings_of_a_table_and_of_its_frames_are_shown(made, tmp_path, run):
+    array, response = made
+    limit = Finding("light", "what, value, limit, remedy", "misfit")
+    dataclasses.replace(response, findings=(limit,)).save(tmp_path / "response.npz")
+    frames = np.stack(list(array.frames(9e6, 8, rng=3))).astype(np.int64)
+    frames += 100 * np.arange(8)[:, None, None]
+    write_frames(tmp_path / "level.tif", frames.astype(np.uint16), nbytes=1)
+    command = ["hardware", tmp_path / "response.npz", "-o", tmp_path / "table.hex", "--force"]
+    assert json.loads(run(*command, "--json")[1])["findings"] == [dataclasses.asdict(limit)]
+    status, out, err = run(*command, "--frames", tmp_path / "level.tif", "--json")
+    assert status == 0
+    own, found = json.loads(out)["findings"]
+    assert own == dataclasses.asdict(limit)
+    assert (found["kind"], err.count("scatter by") > 0) == ("light", True)
 
 
 def test_the_command_writes_a_table(made, tmp_path, run):

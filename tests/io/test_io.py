@@ -26,7 +26,7 @@ import equipix
 from equipix import FrameStatistics, simulate
 from equipix.errors import FileError, InputError
 from equipix.io.formats import load_pages, save_pages, saved_kind
-from equipix.io.frames import read_frames
+from equipix.io.frames import header, read_frames
 from equipix.io.paths import find_files
 from equipix.io.tiff import stream_frames as tiff_frames
 from records import rewrite
@@ -240,6 +240,19 @@ def test_bad_files_are_named(tmp_path: Path, name: str, content: bytes, message:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(FileError, match=rf"{name}: .*{message}"):
         equipix.average(tmp_path / name)
+
+
+@pytest.mark.parametrize("count", [3, 4])
+def test_a_stack_that_tifffile_takes_for_colours_says_how_to_write_it(
+    tmp_path: Path, count: int
+) -> None:
+    path, stack = tmp_path / "stack.tif", np.repeat(WIDE[:1], count, axis=0)
+    tifffile.imwrite(path, stack, photometric="rgb", planarconfig="separate")  # its default
+    for read in (equipix.average, header):
+        with pytest.raises(FileError, match=r"one grey channel: .*photometric='minisblack'$"):
+            read(path)
+    tifffile.imwrite(path, stack, photometric="minisblack")
+    assert equipix.average(path).count.max() == count
 
 
 def test_files_that_differ_are_named_with_what_was_wanted(tmp_path: Path) -> None:
@@ -482,7 +495,7 @@ def test_the_longest_name_can_be_written_by_many_at_once(tmp_path: Path) -> None
 def test_damaged_statistics_are_refused(tmp_path: Path, suffix: str) -> None:
     path, average = tmp_path / f"a{suffix}", equipix.average(WIDE)
     for changed, message in (
-        ({"version": "2"}, "of version 2, this version of equipix reads version 2: make"),
+        ({"version": "3"}, "of version 3, this version of equipix reads version 3: make"),
         ({"version": None}, "of version None"),
         ({"arrays": {"mean": average.mean.astype(np.int64)}}, "damaged: array 'mean' is int64"),
         (
@@ -532,7 +545,7 @@ def test_foreign_and_broken_files_are_refused(tmp_path: Path, suffix: str) -> No
     with pytest.raises(FileError, match="holds something, expected .* or frame statistics or .*na"):
         equipix.load(path)
     save_pages(path, PAGES, {"kind": "frame statistics", "version": 99}, force=True)
-    with pytest.raises(FileError, match=r"of version 99, .* reads version 2: .* install"):
+    with pytest.raises(FileError, match=r"of version 99, .* reads version 3: .* install"):
         equipix.load(path)
     equipix.average(WIDE).save(path, force=True)
     whole = path.read_bytes()

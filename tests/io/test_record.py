@@ -6,6 +6,7 @@ import dataclasses
 import json
 import zlib
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ import tifffile
 from PIL import Image
 
 import equipix
-from equipix import bolometer, hardware, nuc, simulate
+from equipix import bolometer, hardware, lens, nuc, simulate
 from equipix._check import Array
 from equipix.errors import FileError, InputError
 from equipix.exposures.positions import Orientation
@@ -116,6 +117,23 @@ def test_every_kind_comes_back_bit_by_bit(tmp_path, name, suffix):
     assert path.read_bytes() == whole
 
 
+@pytest.mark.parametrize("name", [*KINDS, "lens", "state", "scene"])
+def test_every_kind_states_versions_and_the_time(name):
+    squared = ((np.indices(SHAPE) - 12.0) ** 2).sum(axis=0)
+    others = {
+        "lens": lambda: lens.fit(1000 / (1 + squared / 30.0**2) ** 2).correction(),
+        "state": lambda: KINDS["dynamic"].correction(10.0),
+        "scene": lambda: learned("gated").correction(),
+    }
+    found = others[name]().metadata if name in others else KINDS[name].metadata
+    assert found["versions"] == {"equipix": equipix.__version__, "numpy": np.__version__}
+    finished = datetime.fromisoformat(found["finished"])
+    assert finished <= datetime.now(UTC)
+    if name not in ("polynomial", "lens", "scene"):  # of those nothing is known of the start
+        assert datetime.fromisoformat(found["started"]) <= finished
+        assert found["options"]
+
+
 @pytest.mark.parametrize("name", KINDS)
 def test_other_software_reads_the_pages(tmp_path, name):
     KINDS[name].save(tmp_path / "a.tif")
@@ -155,7 +173,7 @@ def test_a_table_is_read_by_its_suffix(tmp_path):
     for suffix in (".bin", ".hex", ".h"):
         table.save(tmp_path / f"a{suffix}")
         assert differences(table, equipix.load(tmp_path / f"a{suffix}")) == []
-    with pytest.raises(FileError, match=r"none\.bin: cannot be read"):
+    with pytest.raises(FileError, match=r"none\.bin: does not exist"):
         equipix.load(tmp_path / "none.bin")
 
 
@@ -298,7 +316,9 @@ def test_a_reader_of_one_kind_refuses_the_others(tmp_path):
     KINDS["averages"].save(tmp_path / "a.tif")
     with pytest.raises(FileError, match=r"a\.tif: holds frame statistics, expected calibration th"):
         read_record(tmp_path / "a.tif", equipix.Calibration)
-    with pytest.raises(InputError, match=r"expected the suffix \.tif, \.npz or \.fits"):
+    with pytest.raises(
+        InputError, match=r"expected the suffix \.tif, \.tiff, \.npz, \.bin, \.hex or \.h"
+    ):
         equipix.load(tmp_path / "a.txt")
 
 

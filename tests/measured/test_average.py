@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 import equipix
 from equipix.errors import FileError, InputError
+from equipix.io.tiff import write_frames
 from reference.average import average as reference
 
 if TYPE_CHECKING:
@@ -39,6 +40,7 @@ def _stack(dtype: type, shape: tuple[int, int, int], seed: int) -> np.ndarray:
         return rng.integers(0, np.iinfo(dtype).max, shape, dtype=dtype, endpoint=True)
     frames = rng.normal(1000, 30, shape).astype(dtype)
     frames[rng.random(shape) < 0.05] = np.nan
+    frames[0, 0, 0] = 1000  # without any number they are refused
     return frames
 
 
@@ -121,10 +123,21 @@ def test_samples_that_are_not_finite_do_not_count() -> None:
     frames = np.array([np.nan, 1, np.inf, 3, -np.inf, np.nan]).reshape(6, 1, 1)
     result = equipix.average(frames)
     assert (result.mean, result.variance, result.count) == (2, 2, 2)
-    empty = equipix.average(np.full((20, 1, 1), np.nan))
-    assert np.isnan(empty.mean)
-    assert np.isnan(empty.variance_of_mean)
-    assert empty.count == 0
+    pixels = np.ones((20, 1, 2)) * [np.nan, 3]
+    empty = equipix.average(pixels)
+    assert np.isnan(empty.mean[0, 0])
+    assert np.isnan(empty.variance_of_mean[0, 0])
+    assert empty.count.tolist() == [[0, 20]]
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_frames_without_a_number_are_refused(value, dtype, tmp_path) -> None:
+    frames = np.full((3, 4, 5), value, dtype)
+    write_frames(tmp_path / "raw.tif", iter(frames), nbytes=frames.nbytes)
+    for source in (frames, list(frames), tmp_path / "raw.tif", np.ma.masked_all((3, 4, 5))):
+        with pytest.raises(InputError, match="'frames' holds no finite number: give frames with"):
+            equipix.average(source)
 
 
 def same_bytes(a: FrameStatistics, b: FrameStatistics) -> bool:
@@ -203,10 +216,10 @@ FRAMES = np.zeros((3, 4, 5), np.uint8)
         (np.zeros((2, 4, 5), complex), {}, "'frames' has dtype complex128"),
         ([], {}, "'frames' holds no frames"),
         (7, {}, "'frames' is a int"),
-        ([FRAMES[0], FRAMES[0, 1:]], {}, r"'source\[1\]' is uint8 of shape \(3, 5\)"),
-        ([FRAMES[0], FRAMES[0].astype(float)], {}, r"'source\[1\]' is float64"),
-        ([FRAMES], {}, r"'source\[0\]' has shape \(3, 4, 5\)"),
-        ([None], {}, r"'source\[0\]' has dtype object"),
+        ([FRAMES[0], FRAMES[0, 1:]], {}, r"'frames\[1\]' is uint8 of shape \(3, 5\)"),
+        ([FRAMES[0], FRAMES[0].astype(float)], {}, r"'frames\[1\]' is float64"),
+        ([FRAMES], {}, r"'frames\[0\]' has shape \(3, 4, 5\)"),
+        ([None], {}, r"'frames\[0\]' is of type NoneType, expected an array"),
         (FRAMES, {"dark": np.zeros((5, 4))}, r"'dark' has shape \(5, 4\), expected \(4, 5\)"),
         (FRAMES, {"dark": np.zeros(4)}, "'dark' has shape"),
         (FRAMES, {"dark": np.full((4, 5), np.nan)}, "'dark' holds no finite number"),
@@ -344,7 +357,7 @@ def test_masked_whole_numbers_keep_their_saturation_level() -> None:
 
 def test_frames_with_a_mask_and_without_are_not_mixed() -> None:
     frame = np.ones((3, 4))
-    with pytest.raises(InputError, match=r"'source\[1\]' is masked float64 .*, expected float64"):
+    with pytest.raises(InputError, match=r"'frames\[1\]' is masked float64 .*, expected float64"):
         equipix.average([frame, np.ma.masked_equal(frame, 2)])
 
 

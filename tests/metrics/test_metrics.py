@@ -456,7 +456,8 @@ class TestFrames:
         assert np.median(found) == pytest.approx(0.1, rel=0.01)
         drifting = hot + np.linspace(-30, 30, 64)[:, None, None]
         assert np.median(metrics.netd(cold, drifting, 5.0)) == pytest.approx(0.1, rel=0.01)
-        assert (metrics.netd(cold, cold, 5.0) == np.inf).all()
+        hot[:, 5, 6] = cold[:, 5, 6] = 1000
+        assert metrics.netd(cold, hot, 5.0)[5, 6] == np.inf
 
     def test_a_value_that_is_none_stays_in_its_pixel(self):
         rng = np.random.default_rng(14)
@@ -481,6 +482,14 @@ class TestFrames:
             metrics.netd(cold, cold, 0)
         with pytest.raises(errors.InputError, match="'hot' has shape"):
             metrics.netd(cold, cold[:, :2], 1)
+        for hot in (cold, cold[::-1], cold + 1e-3):
+            with pytest.raises(
+                errors.InputError, match=r"'hot' .* 'cold' by .* no more than noise"
+            ):
+                metrics.netd(cold, hot, 10)
+        dark = np.full_like(cold, 3.0)
+        with pytest.raises(errors.InputError, match="'hot' differs from 'cold' by 0 DN"):
+            metrics.netd(dark, dark, 10)
 
     def test_roughness_by_hand(self):
         frame = [[1.0, 2.0, 4.0], [1.0, 1.0, 1.0]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import warnings
 
 import numpy as np
@@ -20,6 +21,11 @@ from equipix.simulate import StaringArray
 
 SHAPE = (24, 32)
 LIGHT = (3e6, 7e6, 11e6, 15e6)
+
+
+def kinds_of(out):
+    """Kinds of the findings in what a command has printed as JSON."""
+    return [each["kind"] for each in json.loads(out)["findings"]]
 
 
 @pytest.fixture(scope="module")
@@ -268,6 +274,7 @@ class TestCommands:
         (tmp_path / "levels.toml").write_text("[[level]]".join(two[:3]), encoding="utf-8")
         status, out, _ = run(*given)
         assert "reduced chi2           not determined" in out
+        assert json.loads(run(*given, "--json")[1])["reduced_chi2"] is None
 
     def test_errors_are_one_line(self, run, folder, tmp_path):
         output = tmp_path / "response.tif"
@@ -349,9 +356,42 @@ class TestDefectsAndQuality:
         frames, once = folder / "level2.tif", tmp_path / "once.tif"
         assert run("correct", saved[1], frames, "-o", once)[0] == 0
         assert "corrected already" not in run("nuc", command, saved[1], frames)[2]
-        status, _, err = run("nuc", command, saved[1], once)
+        status, out, err = run("nuc", command, saved[1], once, "--json")
         assert status == 0
         assert f"{once}: corrected already, by this correction; what both remove is" in err
+        assert "corrected" in kinds_of(out)
+
+    @pytest.fixture
+    def unsteady(self, folder, tmp_path):
+        """Frames whose level drifts by many times the noise of a pixel."""
+        raw = read_frames(folder / "level2.tif").astype(np.int64)
+        drift = np.arange(len(raw))[:, None, None] * 100
+        write_frames(tmp_path / "unsteady.tif", iter((raw + drift).astype(np.uint16)), nbytes=1)
+        return tmp_path / "unsteady.tif"
+
+    def test_findings_of_defects_are_saved_and_shown(self, run, saved, unsteady, tmp_path):
+        response, path = saved
+        outputs = tmp_path / "flagged.npz", tmp_path / "again.npz"
+        status, out, err = run("nuc", "defects", path, unsteady, "-o", outputs[0], "--json")
+        assert status == 0
+        assert "the means of 'frames' scatter by" in err
+        loaded = equipix.load(outputs[0])
+        assert loaded.findings[: len(response.findings)] == response.findings
+        assert [vars(each) for each in loaded.findings] == json.loads(out)["findings"]
+        assert kinds_of(out).count("light") == 1
+        # Those that the response has already stand there once.
+        arguments = ("nuc", "defects", outputs[0], unsteady, "-o", outputs[1])
+        status, out, _ = run(*arguments)
+        assert equipix.load(outputs[1]).findings == loaded.findings
+        assert re.search(r"\nfindings +.*light", out)
+
+    def test_findings_of_quality_are_shown(self, run, saved, unsteady, folder):
+        arguments = ("nuc", "quality", saved[1], unsteady)
+        assert kinds_of(run(*arguments, "--json")[1]) == ["light"]
+        assert re.search(r"\nfindings +light\n", run(*arguments)[1])
+        planes = json.loads(run(*arguments, "--cfa", "RGGB", "--json")[1])
+        assert {each["kind"] for each in planes["findings"]} == {"light"}
+        assert kinds_of(run(*arguments[:3], folder / "level2.tif", "--json")[1]) == []
 
     def test_files_of_another_kind_are_refused(self, run, saved, folder):
         status, _, err = run("nuc", "quality", saved[1], saved[1])
@@ -543,6 +583,10 @@ class TestCorrectedFiles:
         )
         assert "more bits in --bit-depth" in err
         assert call("16.tif", "--dtype", "uint16")[1]["limited_values"] == 0
+        found = [call(f"f{bits}.tif", "--dtype", f"uint{bits}")[1] for bits in (8, 16)]
+        assert [[each["kind"] for each in one["findings"]] for one in found] == [["limited"], []]
+        status, out, _ = run(*arguments, tmp_path / "8.tif", "--dtype", "uint8", "--force")
+        assert re.search(r"\nfindings +limited\n", out)
 
     def test_one_corrector_corrects_all_files(self, corrected, folder, tmp_path, monkeypatch):
         from equipix.correction import apply as module

@@ -562,9 +562,9 @@ class TestRefusals:
             ({"variance": [NOISE] * 2}, "'variance' has 2 entries, expected 8: one a level"),
             (
                 {"variance": 4.0},
-                r"'variance' has shape \(\), expected \(8,\), one number for each level",
+                r"has shape \(\), expected \(8,\), one number for each level, or a NoiseModel$",
             ),
-            ({"variance": np.ones(SHAPE)}, r"'variance' has shape \(48, 64\), expected \(8,\)"),
+            ({"variance": np.ones(SHAPE)}, r"\(48, 64\), expected \(8,\), .* or a NoiseModel$"),
             ({"workers": 0}, "'workers'"),
             ({"saturation": -1}, "'saturation'"),
         ],
@@ -579,7 +579,9 @@ class TestRefusals:
             nuc.fit(levels)
         with pytest.raises(errors.InputError, match=r"'levels' has shape \(0,\)"):
             nuc.fit([])
-        with pytest.raises(errors.InputError, match="'levels' is one average, expected a list"):
+        with pytest.raises(
+            errors.InputError, match="'levels' is one FrameStatistics, expected a list"
+        ):
             nuc.fit(equipix.average(levels))
 
     def test_levels_of_other_shapes(self, levels):

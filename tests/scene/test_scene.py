@@ -656,8 +656,19 @@ def test_workers_are_checked_before_the_state(tmp_path):
 def test_what_was_learned_from_can_be_corrected():
     """Values above the level that counts as saturated too, as of a hot pixel."""
     method = made("local-mean", (48, 64), saturation=0.9)
-    for frame in MovingScene(seed=1, shape=(48, 64)).frames(20):
+    for frame in MovingScene(seed=1, shape=(48, 64)).frames(32):
         values = frame.values.copy()
         values[3, 4] = 1.05
         method.update(values)
     assert np.isfinite(method.correction().correct(values)).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_frames_of_fewer_bits_than_the_range_are_refused(name):
+    method = METHODS[name]((48, 64), "uint16")
+    with pytest.raises(
+        errors.InputError, match=r"'frame': .* 0 to 65535 DN, but the frames are uint8, up"
+    ):
+        method.update(np.ones((48, 64), np.uint8))
+    assert method.frames_taken == 0
+    METHODS[name]((48, 64), (0, 510)).update(np.ones((48, 64), np.uint8))

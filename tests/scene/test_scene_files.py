@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 
 import numpy as np
 import pytest
+import tifffile
 
 import equipix
 from equipix import scene
@@ -75,6 +77,31 @@ def test_a_sequence_goes_on_from_a_saved_state(run, recorded, tmp_path):
     np.testing.assert_array_equal(
         equipix.load(output).coefficients, method.correction().coefficients
     )
+
+
+def test_files_and_findings_are_kept(run, recorded, tmp_path):
+    folder, frames = recorded
+    frame, state, output = (tmp_path / name for name in ("once.tif", "state.npz", "nuc.npz"))
+    tifffile.imwrite(frame, frames, description="corrected by equipix", metadata=None)
+    options = ("-o", output, "--method", "local-mean", *RANGE, "--state", state, "--json")
+    status, out, err = run("scene", frame, *options)
+    assert (status, "corrected already" in err) == (0, True)
+    loaded = equipix.load(output)
+    assert [vars(each) for each in loaded.findings] == json.loads(out)["findings"]
+    assert "corrected" in {each.kind for each in loaded.findings}
+    digest = hashlib.sha256(frame.read_bytes()).hexdigest()
+    assert loaded.metadata["inputs"] == {str(frame): digest}
+    assert loaded.metadata["versions"]["equipix"] == equipix.__version__
+    command = ("scene", folder / "all.tif", "-o", output, "--resume", state, "--force")
+    assert run(*command, "--method", "local-mean")[0] == 0
+    assert [*equipix.load(output).metadata["inputs"]] == [str(folder / "all.tif"), str(state)]
+
+
+def test_a_floor_that_is_not_known_is_said_in_words(run, recorded, tmp_path):
+    command = ("scene", recorded[0] / "frame00*.tif", "-o", tmp_path / "nuc.npz", *RANGE)
+    options = ("--method", "local-mean", "--force")
+    assert re.search(r"\nfloor dn +not determined\n", run(*command, *options)[1])
+    assert json.loads(run(*command, *options, "--json")[1])["floor_dn"] is None
 
 
 def test_the_picture_is_drawn_and_the_table_printed(run, recorded, tmp_path):

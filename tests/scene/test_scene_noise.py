@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import warnings
 
 import numpy as np
@@ -237,7 +238,7 @@ def test_foreign_frames_are_noticed_and_change_nothing(name, kind):
 
 def test_a_range_that_frames_do_not_reach_is_named_before_and_after_loading(tmp_path):
     method = scene.LocalMean(SHAPE, "uint16")
-    for frame in MovingScene(seed=1, shape=SHAPE).frames(20):
+    for frame in MovingScene(seed=1, shape=SHAPE).frames(32):
         method.update(np.clip(np.rint(16383 * frame.values), 0, 16383).astype(np.uint16))
     method.save(tmp_path / "state.npz")
     for each in (method, equipix.load(tmp_path / "state.npz")):
@@ -246,9 +247,29 @@ def test_a_range_that_frames_do_not_reach_is_named_before_and_after_loading(tmp_
 
 
 def test_gains_that_spread_are_named():
-    gains = np.array([-0.04, 1.0, 50.0])
+    gains, method = np.array([-0.04, 1.0, 50.0]), made("local-mean")
+    for frame in MovingScene(seed=1, shape=SHAPE).frames(32):
+        method.update(frame.values)
     with pytest.warns(errors.InputWarning, match=r"the gains spread by 23 \(limit 0.3\)"):
-        say(*ask(_RULES, _Learned(made("gated"), None, None, gains)))
+        say(*ask(_RULES, _Learned(method, None, None, gains)))
+
+
+def test_a_correction_from_few_frames_says_so():
+    method = made("local-mean")
+    frames = MovingScene(seed=1, shape=SHAPE).frames(32)
+    for frame in itertools.islice(frames, 2):
+        method.update(frame.values)
+    with pytest.warns(
+        errors.InputWarning, match=r"only 2 of the frames counted \(limit 32, from which 'floor'"
+    ):
+        found = method.correction().findings
+    assert [each.kind for each in found] == ["few"]
+    for frame in itertools.islice(frames, 29):
+        method.update(frame.values)
+    assert method.floor is None
+    method.update(next(frames).values)
+    assert method.floor is not None
+    assert method.correction().findings == ()
 
 
 @pytest.mark.parametrize("name", NAMES)

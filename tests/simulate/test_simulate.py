@@ -35,8 +35,30 @@ class TestSensitivities:
         first, second = (simulate.cosine_sensitivity((4, 4), rng=7) for _ in range(2))
         np.testing.assert_array_equal(first, second)
 
+    @pytest.mark.parametrize("shape", [(0, 5), (5, 0), (5,), (2.5, 3), (-1, 3)])
+    def test_an_empty_sensor_is_refused(self, shape):
+        for make in (
+            lambda: simulate.paper_sensitivity(shape, rng=1),
+            lambda: simulate.gaussian_beam(shape),
+        ):
+            with pytest.raises(
+                InputError, match=r"'shape' is \(.*, expected \(rows, cols\), each 1"
+            ):
+                make()
+
 
 class TestBeams:
+    @pytest.mark.parametrize("beam", [np.ones((5, 5)), np.ones(5), None, [1.0]])
+    def test_values_of_a_beam_are_refused(self, beam):
+        sensitivity = np.ones((48, 64))
+        for take in (
+            lambda: simulate.experiment(sensitivity, beam, CROSS, rng=1),
+            lambda: simulate.exposures(sensitivity, beam, CROSS),
+            lambda: simulate.noise_prediction(sensitivity, beam, CROSS, 1e-6, rng=1),
+        ):
+            with pytest.raises(InputError, match=r"'beam' is of type \w+, expected a function of"):
+                take()
+
     def test_gaussian_falls_to_one_over_e_at_its_width(self):
         beam = simulate.gaussian_beam((11, 21), width=30, amplitude=2)
         np.testing.assert_allclose(

@@ -37,7 +37,7 @@ class DynamicCorrection(Record, kind="dynamic correction", version=2):
     flags : ndarray, shape (rows, cols), uint32
         Bits of `equipix.Flag`.
     metadata : dict
-        Options and prediction errors, as JSON values.
+        Versions, options, times and prediction errors, as JSON values.
     findings : tuple of Finding
         What limits the result, each also a warning of the fit.
 

@@ -12,7 +12,8 @@ from equipix.bolometer.dynamic import DynamicCorrection
 from equipix.bolometer.held_out import HIGHEST, STATES, Judged, Observed
 from equipix.bolometer.states import Axes, Regressor, States, check_spread, solver_of
 from equipix.errors import InputError
-from equipix.findings import Finding, Flag, ask, say, set_bits, usable
+from equipix.findings import Finding, Findings, Flag, ask, say, set_bits, usable
+from equipix.io.record import made, now
 from equipix.measured.defects import BadPixels, response_outliers
 from equipix.measured.measured import Measured, measured_of
 from equipix.measured.saturation import clipping
@@ -115,6 +116,7 @@ def fit(
     >>> bool(np.std(left) < 1e-4 * np.std(array.mean(10.0)))
     True
     """
+    started = now()
     taken = references_of("shutter", shutter)
     states = States.of(substrate_c, bias_v, len(taken), bias_order, regressor)
     bodies = [] if black_bodies is None else _bodies(black_bodies, taken.shape, len(taken))
@@ -128,15 +130,13 @@ def fit(
     said += more
     axes, offset = _coefficients(shown, chosen)
     level = np.asarray(solver_of(axes, states) @ shown.mean)
-    metadata: dict[str, Any] = {
-        "options": {
-            "order": chosen if errors is None else "auto",
-            "bias_order": states.bias_order,
-            "regressor": regressor,
-            "black_bodies": bool(bodies),
-        },
-        "prediction_errors": errors,
+    options = {
+        "order": chosen if errors is None else "auto",
+        "bias_order": states.bias_order,
+        "regressor": regressor,
+        "black_bodies": bool(bodies),
     }
+    metadata = made(options=options, started=started, prediction_errors=errors)
     if not bodies:
         return DynamicCorrection(offset, None, level, axes, axes, flags, metadata, said)
     response, variance = response_of(bodies, good)
@@ -156,7 +156,7 @@ def _coefficients(shown: Observed, order: int) -> tuple[Axes, Floats]:
 
 def _order(
     shown: Observed, order: int | Literal["auto"]
-) -> tuple[int, list[float] | None, tuple[Finding, ...]]:
+) -> tuple[int, list[float] | None, Findings]:
     """Order that is given, or that which best predicts; prediction errors, and findings."""
     errors: list[float] | None = None
     if isinstance(order, str) and order == "auto":
@@ -170,8 +170,6 @@ def _order(
 
 def references_of(name: str, given: Any) -> Measured:
     """Mean frames of all states; of averages with the variances of their means."""
-    if isinstance(given, FrameStatistics):
-        raise InputError(f"'{name}' is one FrameStatistics, expected a sequence: one a state")
     listed: list[Any] = list(given) if isinstance(given, list | tuple) else []
     averages = [each for each in listed if isinstance(each, FrameStatistics)]
     means = [each.mean if isinstance(each, FrameStatistics) else each for each in listed]

@@ -1,13 +1,10 @@
 """Shift calibration: sensitivity and beam from exposures of one beam at several positions."""
 
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from typing import Any, Literal
 
-import numpy as np
 from numpy.typing import ArrayLike
 
-from equipix import _native
 from equipix._check import FluxModel, Method, Progress, naming_memory
 from equipix._native import Fit
 from equipix.calibration.result import Calibration
@@ -22,6 +19,7 @@ from equipix.fitting.error_bars import with_dark_misfit
 from equipix.fitting.pixels import without_faint_pixels, without_false_pixels
 from equipix.fitting.stated_errors import steadied, widened
 from equipix.fitting.weighted import Options, is_to_be_fitted, weighted_fit
+from equipix.io.record import made, now
 from equipix.measured.colour import Colours
 from equipix.measured.measured import measured_of
 from equipix.measured.noise import NoiseModel
@@ -248,7 +246,7 @@ def calibrated(
     The fit starts from `start`; `said` are findings before, and `provenance` is added to the
     metadata.
     """
-    started = datetime.now(UTC)
+    started = now()
     said += say(*ask(BEFORE, exposures))
     weighted = steadied(weighted_fit(exposures, options, start), exposures, options)
     # Until weights and priors are final.
@@ -262,7 +260,7 @@ def calibrated(
     return Calibration.of(evidence, said, _metadata(evidence, started) | (provenance or {}))
 
 
-def _metadata(evidence: Evidence, started: datetime) -> dict[str, Any]:
+def _metadata(evidence: Evidence, started: str) -> dict[str, Any]:
     """Versions, options and times, as JSON values."""
     exposures, fit, options = evidence.exposures, evidence.fit, evidence.options
     dark, bars, rejected = evidence.dark, evidence.bars, evidence.weighted.rejected
@@ -280,12 +278,7 @@ def _metadata(evidence: Evidence, started: datetime) -> dict[str, Any]:
         chosen["cfa"] = exposures.cfa.written
     if exposures.positions.std is not None:
         chosen["shifts"] = fit.refinement
-    metadata: dict[str, Any] = {
-        "versions": {"equipix": _native.__version__, "numpy": np.__version__},
-        "options": chosen,
-        "started": started.isoformat(timespec="seconds"),
-        "finished": datetime.now(UTC).isoformat(timespec="seconds"),
-    }
+    metadata = made(options=chosen, started=started)
     if dark is not None:
         metadata["dark"] = dark._asdict()
     if rejected is not None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from equipix._check import (
     Array,
@@ -27,7 +27,7 @@ from equipix.diagnosis.lamp_drift import Drift
 from equipix.diagnosis.orientation import OrientationTest
 from equipix.errors import InputError
 from equipix.exposures.positions import ROUNDING, Positions, as_rotation
-from equipix.findings import Finding, determined
+from equipix.findings import Findings, determined
 from equipix.fitting.error_bars import functional_std
 from equipix.fitting.weighted import Weighted, check_unchanged
 from equipix.io.record import UNSAVED, Counts, Map, Record
@@ -89,7 +89,8 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
     components : int
         Number of connected components: parts of the sensor that the measurements do not compare.
         A pixel that does not respond connects no parts; nor does one whose measurements have
-        almost no weight.
+        almost no weight. Where shifts differ by parts of pixels, neighbours see cells in common,
+        so that 1 does not prove that the positions determine the sensitivity: see `is_partial`.
     component_labels : ndarray, shape (rows, cols), int32
         The component of each pixel, the largest being 0; −1 for a pixel without measurement.
     sweeps : int
@@ -185,7 +186,7 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
     shift_sign: ShiftSign = "undetermined"
     orientation: OrientationTest | None = None
     drift: Drift | None = None
-    findings: tuple[Finding, ...] = ()
+    findings: Findings = ()
     cfa: Colours | None = None
     colour_response: dict[str, float] | None = None
     takes_dark: ClassVar[bool] = True
@@ -206,12 +207,7 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
         Colours.of(self.cfa)
 
     @classmethod
-    def of(
-        cls,
-        evidence: Evidence,
-        findings: tuple[Finding, ...],
-        metadata: dict[str, Any],
-    ) -> Self:
+    def of(cls, evidence: Evidence, findings: Findings, metadata: dict[str, Any]) -> Self:
         """Make the result from a fit and what was derived from it."""
         exposures, fit, bars = evidence.exposures, evidence.fit, evidence.bars
         dtype, flags, orientation = exposures.values.dtype, evidence.flags, evidence.orientation
@@ -309,11 +305,7 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
         return dataclasses.replace(self)
 
     def std_of(
-        self,
-        weights: ArrayLike,
-        *,
-        workers: int | None = None,
-        progress: Progress | None = None,
+        self, weights: ArrayLike, *, workers: int | None = None, progress: Progress | None = None
     ) -> float | NDArray[Any]:
         """Standard deviation of Σ weights · ln M by noise, large scales included.
 
@@ -387,16 +379,18 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
         c_0 = −dark/M and c_1 = 1/M, in the dtype of `sensitivity`; NaN where M is undetermined.
         Without a dark frame in the calibration c_0 is 0, for frames whose dark is subtracted.
         """
-        return self._planes.astype(self.sensitivity.dtype)
+        return self._planes(self.sensitivity.dtype)
 
-    @property
-    def _planes(self) -> NDArray[Any]:
-        """The coefficients in double precision."""
+    def _planes(self, dtype: DTypeLike) -> NDArray[Any]:
+        """The coefficients, found in double precision and rounded once."""
+        planes = np.zeros((2, *self.shape), dtype)
         with np.errstate(divide="ignore", invalid="ignore"):  # a dead pixel may have M = 0
-            inverse = 1 / self.sensitivity.astype(np.float64)
-            offset = np.zeros_like(inverse) if self.dark is None else -self.dark * inverse
-        offset[np.isnan(inverse)] = np.nan
-        return np.stack([offset, inverse])
+            inverse = np.divide(1, self.sensitivity, dtype=np.float64)
+            if self.dark is not None:
+                planes[0] = -self.dark * inverse
+        planes[0, np.isnan(inverse)] = np.nan
+        planes[1] = inverse
+        return planes
 
     def predict(self, shift: ArrayLike, *, rotation: int = 0, flux: float = 1.0) -> NDArray[Any]:
         """Frame that the sensor would give at another position: c · L(u) · M(p).

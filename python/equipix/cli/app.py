@@ -96,7 +96,10 @@ def show_warning(message: Warning | str, *_: object, **__: object) -> None:
     say("warning", message)
 
 
-_VALUE = r"(?:'([^']*)'|(\w+(?:\.\w+)*))"
+_VALUE = r"(?:'([^']*)'|\(([^,)]*),([^)]*)\)|(\w+(?:\.\w+)*))"
+
+_CALLS = r"\bequipix\.(average|calibrate|nuc\.fit|plan)(?:(?<=plan)\.\w+)?(\([^)]*\))?(?!\.?\w)"
+"""Names of functions that are commands, too."""
 
 
 def in_options(message: str, called: Any) -> str:
@@ -111,6 +114,8 @@ def in_options(message: str, called: Any) -> str:
         for each in parameters
         if each.param_type_name == "option"
     }
+    message = re.sub(_CALLS, lambda found: f"equipix {found[1].replace('.', ' ')}", message)
+    message = re.sub(r",? or None\b", "", message)
     for name, option in options.items():
         message = _with_values(message, name, option)
     if ".toml: " in message:
@@ -119,6 +124,7 @@ def in_options(message: str, called: Any) -> str:
         message = re.sub(rf"(?<!key )'{name}'(?! (?:in|of) )", option, message)
         if "_" in name:
             message = re.sub(rf"(?<![\w'/.\\-]){name}(?![\w'=/\\]|\.\w)", option, message)
+    message = message.replace("'shifts'", "'shift'")  # as manifests have it
     for name in _python_only() - {each.name for each in parameters}:
         message = message.replace(f"'{name}'", f"'{name}' (in Python)")
     return message
@@ -126,8 +132,8 @@ def in_options(message: str, called: Any) -> str:
 
 def _with_values(message: str, name: str, option: str) -> str:
     """Write ``name='value'`` and ``'name' (--name value)`` as ``--name value``."""
-    message = re.sub(rf"'{name}' \(({option}[^)]*)\)", r"\1", message)
-    message = re.sub(rf"\b{name}={_VALUE}", rf"{option} \1\2", message)
+    message = re.sub(rf"(?<!=)'\w+' \(({option}[^)]*)\)", r"\1", message)
+    message = re.sub(rf"\b{name}={_VALUE}", rf"{option} \1\2\3\4", message)
     message = message.replace(f"{option} True", option)
     return re.sub(rf"({option}(?: \w+)?)(?:, \1| \(\1\))", r"\1", message)
 

@@ -19,7 +19,7 @@ from equipix.io.record import read_record
 from equipix.pictures import check_picture, draw_comparison, save_figure
 from equipix.report.drawing import draw_result
 from equipix.report.figures import summary
-from equipix.saved_results import load
+from equipix.saved_results import READ, load
 
 commands = typer.Typer()
 
@@ -60,7 +60,7 @@ def calibrate(
         calibration = loaded.run(mask=excluded, workers=workers, progress=progress, **options)
     if not partial:
         _refuse_partial(calibration, output)
-    terminal.show_saved(output, calibration, calibration.findings, force=force, as_json=as_json)
+    terminal.show_saved(output, calibration, force=force, as_json=as_json)
 
 
 def _refuse_partial(calibration: Calibration, output: Path) -> None:
@@ -74,7 +74,7 @@ def _refuse_partial(calibration: Calibration, output: Path) -> None:
 
 @commands.command(epilog="Example: equipix inspect cal.tif -o cal.png")
 def inspect(
-    file: Annotated[Path, typer.Argument(help="A result that equipix has saved.")],
+    file: Annotated[Path, typer.Argument(help=f"A result: {READ}.")],
     output: terminal.Picture = None,
     force: terminal.Force = False,
     as_json: terminal.Json = False,

@@ -1,5 +1,6 @@
 """Commands about frames: average, correct."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -8,19 +9,16 @@ import typer
 from equipix.cli import terminal
 from equipix.correction.correct_files import correct_files, is_folder
 from equipix.errors import InputError
-from equipix.experiment.image_files import origin_of, refuse_repeated_files
+from equipix.experiment.image_files import origin_of, refuse_repeated_files, with_inputs
 from equipix.findings import ask, say
 from equipix.io.formats import SUFFIXES
 from equipix.io.paths import find_files, refuse_inputs
 from equipix.measured import statistics
 from equipix.measured.average import average as average_frames
 from equipix.report.figures import known
-from equipix.saved_results import load_correction
+from equipix.saved_results import READ, load_correction
 
 commands = typer.Typer()
-
-_OTHER_FORMATS = (".jpg", ".jpeg", ".bmp", ".pgm", ".fits", ".fit", ".npz", ".npy")
-"""Formats of images that `correct` does not write."""
 
 
 @commands.command(epilog="Example: equipix average frames/*.png --dark 'dark/*.png' -o mean.tif")
@@ -45,7 +43,7 @@ def average(
     terminal.check_output(output, force=force, suffixes=SUFFIXES)
     images, offsets = find_files(frames), find_files(dark) if dark else []
     refuse_inputs([output], [*images, *offsets, *terminal.given(mask)])
-    refuse_repeated_files(images, offsets)
+    hashes = refuse_repeated_files(images, offsets)
     with terminal.working(mask) as (progress, excluded):
         offset = None
         common: dict[str, Any] = {"workers": workers, "progress": progress}
@@ -56,7 +54,8 @@ def average(
             statistics.refuse_subtracted(offset, " ".join(dark))
         found = average_frames(frames, dark=offset, mask=excluded, **common, **options)
     said = say(*ask(statistics.AVERAGED, found))
-    terminal.show_saved(output, found, said, force=force, as_json=as_json)
+    found = replace(found, findings=said, metadata=with_inputs(found.metadata, hashes))
+    terminal.show_saved(output, found, force=force, as_json=as_json)
 
 
 @commands.command(epilog="Example: equipix correct cal.tif raw/*.tif -o corrected/")
@@ -72,7 +71,7 @@ def average(
     "its 'histogram' with a plateau of 4 times the mean of its bins.",
 )
 def correct(
-    correction: Annotated[Path, typer.Argument(help="A calibration or a response: .tif or .npz.")],
+    correction: Annotated[Path, typer.Argument(help=f"A correction: {READ}.")],
     frames: Annotated[list[str], typer.Argument(help="Image files or globs.")],
     output: Annotated[
         Path,
@@ -109,13 +108,13 @@ def correct(
         unusable_pixels=done.flagged or None,
     )
     result = {"output": str(output), "frames": done.frames, "dtype": done.dtype, **counts}
-    terminal.show_result(result, as_json=as_json)
+    terminal.show_result(result, done.findings, as_json=as_json)
 
 
 def _refuse_image(output: Path) -> None:
-    """Refuse a folder that is named like a file of another format."""
-    if output.suffix.lower() in _OTHER_FORMATS and not output.is_dir():
+    """Refuse a new folder that is named like a file of another format."""
+    if output.suffix and is_folder(output) and not output.is_dir():
         raise InputError(
             f"'{output}' ends in '{output.suffix}', but corrected frames are written as .tif: name "
-            "a .tif file, a .png, or a folder for a .tif of each input"
+            "a .tif, a .png of one frame, or a folder (one with a dot in its name: make it first)"
         )

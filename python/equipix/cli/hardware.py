@@ -9,11 +9,11 @@ import typer
 from equipix._check import naming_memory
 from equipix.cli import terminal
 from equipix.correction.protocol import Correction, check_sensor
-from equipix.findings import usable
+from equipix.findings import Findings, usable
 from equipix.hardware.quality import quality, smallest_widths
 from equipix.hardware.table import SUFFIXES, Table
 from equipix.hardware.words import STEPS
-from equipix.saved_results import load_correction
+from equipix.saved_results import READ, load_correction
 
 _SOUGHT = ("offset_bits", "gain_bits")
 """Widths of which the smallest that suffice are sought."""
@@ -40,7 +40,7 @@ commands = typer.Typer()
     linearise="Raw values in DN between which a line replaces a curved correction.",
 )
 def hardware(
-    result: Annotated[Path, typer.Argument(help="A calibration or a response: .tif or .npz.")],
+    result: Annotated[Path, typer.Argument(help=f"A correction: {READ}.")],
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Table: .bin, .hex ($readmemh) or .h (C).")
     ],
@@ -60,19 +60,20 @@ def hardware(
     correction = load_correction(result)
     check_sensor(correction, sensor)
     table = Table.of(correction, **options)
-    cost = _cost(correction, frames, options) if frames else {}
+    cost, said = _cost(correction, frames, options) if frames else ({}, ())
     table.save(output, force=force)
-    terminal.show_result({"output": str(output), **_summary(table), **cost}, as_json=as_json)
+    figures = {"output": str(output), **_summary(table), **cost}
+    terminal.show_result(figures, table.findings + said, as_json=as_json)
 
 
 def _summary(table: Table) -> dict[str, Any]:
     """Collect the main figures of a table."""
-    told = asdict(table.format)
+    form = asdict(table.format)
     linearised = table.metadata.get("linearised")
     return {
         "shape": list(table.shape),
-        "bits": {name.removesuffix("_bits"): told[name] for name in told if "_bits" in name},
-        "steps": {name: 2.0 ** told[name] for name in STEPS},
+        "bits": {name.removesuffix("_bits"): form[name] for name in form if "_bits" in name},
+        "steps": {name: 2.0 ** form[name] for name in STEPS},
         "base": table.format.base,
         "zero": table.format.zero,
         "unusable_pixels": int((~usable(table.flags)).sum()),
@@ -82,14 +83,16 @@ def _summary(table: Table) -> dict[str, Any]:
     }
 
 
-def _cost(correction: Correction, frames: list[str], options: dict[str, Any]) -> dict[str, Any]:
+def _cost(
+    correction: Correction, frames: list[str], options: dict[str, Any]
+) -> tuple[dict[str, Any], Findings]:
     """Measure C of frames of one level by correction and table, and the widths that suffice."""
     with naming_memory("measuring quality"):
-        raw = terminal.raw_frames(frames)
+        raw, said = terminal.raw_frames(frames)
         found = quality(correction, raw, **options)
         others = {name: value for name, value in options.items() if name not in _SOUGHT}
         widths = smallest_widths(correction, [raw], **others)
-    return {
+    figures = {
         "C": found.before.ratio,
         "C_of_table": found.after.ratio,
         "added_noise": found.added,
@@ -98,3 +101,4 @@ def _cost(correction: Correction, frames: list[str], options: dict[str, Any]) ->
             each: getattr(widths, f"{each}_bits") for each in ("offset", "gain", "both")
         },
     }
+    return figures, said + found.before.findings

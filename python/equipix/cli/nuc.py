@@ -12,6 +12,7 @@ from equipix._check import Array, By, Flagged, Order, naming_memory
 from equipix.cli import terminal
 from equipix.correction.protocol import Correction, check_sensor, named_cfa
 from equipix.experiment.level_experiment import LevelExperiment
+from equipix.findings import Findings
 from equipix.io.formats import SUFFIXES
 from equipix.io.paths import refuse_inputs
 from equipix.io.record import read_record
@@ -20,8 +21,7 @@ from equipix.measured.defects import DefectLimits
 from equipix.nuc.defect_search import find_defects
 from equipix.nuc.response import Response
 from equipix.report.figures import flagged as flag_counts
-from equipix.report.figures import told
-from equipix.saved_results import load_correction
+from equipix.saved_results import READ, load_correction
 
 commands = typer.Typer()
 
@@ -57,7 +57,7 @@ def fit(
         response = loaded.run(
             order=_ORDERS[order], by=by, mask=excluded, workers=workers, progress=progress
         )
-    terminal.show_saved(output, response, response.findings, force=force, as_json=as_json)
+    terminal.show_saved(output, response, force=force, as_json=as_json)
 
 
 @nuc.command(epilog="Example: equipix nuc defects response.tif level/*.tif -o flagged.tif")
@@ -92,21 +92,20 @@ def defects(
     curves = read_record(response, Response)
     check_sensor(curves, sensor)
     with naming_memory("finding bad pixels"):
-        raw = None if not frames else terminal.raw_frames(frames, response)
+        raw, said = terminal.raw_frames(frames, response) if frames else (None, ())
         found = find_defects(curves, raw, cfa=cfa, limits=limits)
-    flagged = curves.with_flags(found.flags, cfa=cfa)
+    flagged = curves.with_flags(found.flags, cfa=cfa, findings=said + found.findings)
     if output is not None:
         flagged.save(output, force=force)
     result: dict[str, Any] = {"output": str(output or "none"), **found.counts}
     result |= {kind: f"not determinable {why}" for kind, why in found.not_determinable.items()}
     result |= {"percentiles_of_K": found.gain_percentiles, "flagged_pixels": flag_counts(flagged)}
-    result |= told(found.findings, as_json=as_json)
-    terminal.show_result(result, as_json=as_json)
+    terminal.show_result(result, flagged.findings, as_json=as_json)
 
 
 @nuc.command(epilog="Example: equipix nuc quality response.tif level/*.tif")
 def quality(
-    correction: Annotated[Path, typer.Argument(help="A response or a calibration: .tif or .npz.")],
+    correction: Annotated[Path, typer.Argument(help=f"A correction: {READ}.")],
     frames: Annotated[list[str], typer.Argument(help="Raw frames of one steady even level.")],
     confidence: Annotated[
         float, typer.Option(help="Probability of the confidence interval.")
@@ -123,13 +122,14 @@ def quality(
     check_sensor(loaded, sensor)
     colours = named_cfa(loaded, cfa)
     with naming_memory("measuring quality"):
-        result = _quality(loaded, terminal.raw_frames(frames, correction), colours, confidence)
-    terminal.show_result(result, as_json=as_json)
+        raw, said = terminal.raw_frames(frames, correction)
+        result, more = _quality(loaded, raw, colours, confidence)
+    terminal.show_result(result, said + more, as_json=as_json)
 
 
 def _quality(
     correction: Correction, raw: Array, colours: Colours | None, confidence: float
-) -> dict[str, Any]:
+) -> tuple[dict[str, Any], Findings]:
     """Measure spatial over temporal noise of corrected frames, and its parts; of each plane."""
 
     def planes(flagged: Flagged) -> Iterable[tuple[str, Array]]:
@@ -160,4 +160,5 @@ def _quality(
         }
         for name, good in usable.items()
     }
-    return result[""] if colours is None else result
+    said = tuple(each for good in usable.values() for each in good.findings)
+    return result[""] if colours is None else result, said

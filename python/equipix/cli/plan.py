@@ -1,5 +1,6 @@
 """The command plan: errors of a pattern of shifts, and better patterns."""
 
+from dataclasses import replace
 from typing import Annotated, Any
 
 import typer
@@ -7,7 +8,7 @@ import typer
 from equipix.cli import terminal
 from equipix.errors import InputError
 from equipix.exposures.positions import whole_moves
-from equipix.findings import Finding, say
+from equipix.findings import Finding, Findings, say
 from equipix.pictures import check_picture, draw_plans, save_figure
 from equipix.plan.budget import ErrorBudget, error_budget
 from equipix.plan.components import identify
@@ -54,9 +55,10 @@ def plan(
         raise InputError(
             "give either '--shifts', to evaluate a pattern, or '--max-shift', to find patterns"
         )
+    said: Findings = ()
     if causes["shift_error"] and causes["beam_width"] is None:
         words = "'--shift-error' has no effect in an even beam: give '--beam-width' for another"
-        say(Finding("unused", words, "input", "note"))
+        said = say(Finding("unused", words, "input", "note"))
     check_picture(output)
     terminal.check_output(output, force=force)
     if shifts is not None:
@@ -71,6 +73,7 @@ def plan(
         budgets = [suggestion.budget for suggestion in found]
     if output is not None:
         save_figure(draw_plans(budgets), output, force=force)
+    budgets = [replace(each, findings=said + each.findings) for each in budgets]
     plans = [_plan_summary(budget, cfa) for budget in budgets]
     if as_json:
         result = {"shape": list(shape), "patterns": plans}

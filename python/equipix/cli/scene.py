@@ -1,5 +1,6 @@
 """The command about corrections from the scene: scene."""
 
+from dataclasses import replace
 from inspect import signature
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -8,14 +9,15 @@ import typer
 
 from equipix.cli import terminal
 from equipix.errors import FileError, InputError
+from equipix.experiment.image_files import sha256_of, with_inputs
 from equipix.io.formats import SUFFIXES, raw_header
 from equipix.io.paths import find_files, refuse_inputs
 from equipix.io.record import read_record
 from equipix.pictures import check_picture, draw_sequence, save_figure
-from equipix.report.figures import of_scene, told
+from equipix.report.figures import of_scene
 from equipix.scene.methods import METHODS, resumed
-from equipix.scene.scene_correction import SceneCorrection, SceneState
-from equipix.scene.sequence import SequenceResult, check_range, run_sequence
+from equipix.scene.scene_correction import SceneCorrection, SceneState, check_range
+from equipix.scene.sequence import SequenceResult, run_sequence
 
 commands = typer.Typer()
 
@@ -89,13 +91,16 @@ def scene(
         learning = _method(method, frames, chosen, resume, workers)
         done = run_sequence(learning, frames, output=corrected, force=force, progress=progress)
     result = learning.correction()
+    used = sha256_of([*dict.fromkeys(find_files(frames)), *terminal.given(resume, mask)])
+    metadata, said = with_inputs(result.metadata, used), done.findings + result.findings
+    result = replace(result, metadata=metadata, findings=said)
     result.save(output, force=force)
     if state is not None:
         learning.save(state, force=force)
     if picture is not None:
         save_figure(draw_sequence(done, result), picture, force=force)
     figures = _summary(output, learning, done)
-    terminal.show_result(figures | told(result.findings, as_json=as_json), as_json=as_json)
+    terminal.show_result(figures, result.findings, as_json=as_json)
 
 
 def _method(
@@ -119,7 +124,7 @@ def _method(
             )
         if state.method != name:
             raise InputError(f"{resume}: is of --method {state.method}, not of {name}: name that")
-        check_range(state.data_range, dtype, resume)
+        check_range(state.data_range, dtype, str(resume))
         return resumed(resume, state, workers=workers)
     if "data_range" not in options and dtype.kind != "u":
         raise InputError(

@@ -4,6 +4,7 @@ import inspect
 import json
 import math
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -14,15 +15,21 @@ import typer
 from typer.models import OptionInfo
 
 from equipix._check import Array, Bools, Progress
+from equipix.calibration.result import Calibration
 from equipix.correction.correct_files import warn_of_corrected
 from equipix.errors import FileError, InputError
 from equipix.experiment import image_files
-from equipix.findings import Finding
-from equipix.io.formats import raw_header
-from equipix.io.frames import read_frames, read_mask
+from equipix.findings import Findings
+from equipix.io.formats import raw_header, read_mask
+from equipix.io.frames import read_frames
 from equipix.io.paths import find_files, refuse_inputs
-from equipix.io.record import Record
+from equipix.measured.statistics import FrameStatistics
+from equipix.nuc.response import Response
 from equipix.report.figures import summary, told
+
+_Saved = Calibration | FrameStatistics | Response
+
+_NO_NUMBER = r"\(?-?\b(?:inf|nan)\b.*"
 
 _WHOLE = 1e9
 """Whole numbers below this are printed with all digits, as saturation levels are."""
@@ -65,10 +72,12 @@ def _announcer() -> Progress:
     return report
 
 
-def show_result(result: dict[str, Any], *, as_json: bool) -> None:
-    """Print a result as one JSON object or as a table."""
+def show_result(result: dict[str, Any], found: Findings | None = None, *, as_json: bool) -> None:
+    """Print a result as one JSON object or as a table, with its findings where it can have any."""
+    result = result if found is None else result | told(found, as_json=as_json)
     if as_json:
-        print(json.dumps(_json_value(result), allow_nan=False))  # noqa: T201
+        # JSON has no NaN and no infinity: null is what is not determined.
+        print(json.dumps(json.loads(json.dumps(result), parse_constant=lambda _: None)))  # noqa: T201
         return
     width = max(map(len, result))
     for name, value in result.items():
@@ -76,13 +85,10 @@ def show_result(result: dict[str, Any], *, as_json: bool) -> None:
         print(f"{name.replace('_', ' '):<{width}}  {words}")  # noqa: T201
 
 
-def show_saved(
-    output: Path, result: Record, findings: Iterable[Finding], *, force: bool, as_json: bool
-) -> None:
+def show_saved(output: Path, result: _Saved, *, force: bool, as_json: bool) -> None:
     """Save a result, and print its main figures and its findings."""
     result.save(output, force=force)
-    figures = {"output": str(output), **summary(result), **told(findings, as_json=as_json)}
-    show_result(figures, as_json=as_json)
+    show_result({"output": str(output), **summary(result)}, result.findings, as_json=as_json)
 
 
 def show_table(titles: Iterable[str], rows: Iterable[Iterable[str]]) -> None:
@@ -90,8 +96,8 @@ def show_table(titles: Iterable[str], rows: Iterable[Iterable[str]]) -> None:
     from rich import box, console, table
 
     shown = table.Table(*titles, box=box.SIMPLE_HEAD)
-    for row in rows:
-        shown.add_row(*row)
+    for title, *cells in rows:
+        shown.add_row(title, *(re.sub(_NO_NUMBER, "not determined", cell) for cell in cells))
     console.Console(soft_wrap=True).print(shown)
 
 
@@ -129,13 +135,13 @@ def check_output(
     refuse_inputs([path], list(inputs))
 
 
-def raw_frames(frames: Iterable[str], correction: Path | None = None) -> Array:
+def raw_frames(frames: Iterable[str], correction: Path | None = None) -> tuple[Array, Findings]:
     """Read raw frames; refuse files that equipix has saved, and warn of those it has corrected."""
     files = find_files(frames)
     headers = {file: raw_header(file) for file in files}
-    if correction is not None:
-        warn_of_corrected(headers, image_files.origin_of(correction))
-    return read_frames(files)
+    origin = "" if correction is None else image_files.origin_of(correction)
+    said = warn_of_corrected(headers, origin)
+    return read_frames(files), said
 
 
 def given(*paths: Path | None) -> list[Path]:
@@ -197,13 +203,9 @@ def options_of(
     return declared
 
 
-def _json_value(value: Any) -> Any:
-    """Replace numbers that JSON does not have by None."""
-    if isinstance(value, dict):
-        return {key: _json_value(item) for key, item in value.items()}
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+def _figure(value: float, form: str) -> str:
+    """Write a number; what is none is not determined."""
+    return f"{value:{form}}" if math.isfinite(value) else "not determined"
 
 
 def _words(value: Any) -> str:
@@ -211,15 +213,15 @@ def _words(value: Any) -> str:
         case bool():
             return "yes" if value else "no"
         case float():
-            return f"{value:.0f}" if value.is_integer() and abs(value) < _WHOLE else f"{value:.4g}"
+            return _figure(value, ".0f" if value.is_integer() and abs(value) < _WHOLE else ".4g")
         case dict():
             return ", ".join(f"{name} {_words(item)}" for name, item in value.items()) or "none"
-        case []:
+        case [] | () | None:
             return "none"
         case [dict(), *_]:
             return "\n".join(map(_row, value))
         case [float(), *_]:
-            return ", ".join(f"{item:.6g}" for item in value)
+            return ", ".join(_figure(item, ".6g") for item in value)
         case [str(), *_]:
             return ", ".join(value)
         case list() | tuple():
@@ -246,7 +248,7 @@ Cfa = Annotated[
     str | None,
     typer.Option(
         help="Colour filters of the pixels: RGGB, GRBG, GBRG or BGGR, or the rows of one period, "
-        "such as RRGG/RRGG/GGBB/GGBB, or RGBW/ of one row."
+        "such as RRGG/RRGG/GGBB/GGBB, or RGB/ of one row."
     ),
 ]
 

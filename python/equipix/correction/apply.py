@@ -148,6 +148,7 @@ class CorrectionBase(Shown, ReadOnly):
         *,
         dark: Dark = "stored",
         flagged: Flagged = "nan",
+        exact: bool = False,
         out: Array | None = None,
     ) -> Array:
         """Frames as a sensor of equal pixels would have given them, Σ c_j y^j of raw values y.
@@ -162,31 +163,56 @@ class CorrectionBase(Shown, ReadOnly):
             `takes_dark` takes another than "stored".
         flagged : {"nan", "keep", "replace"}
             The value of pixels flagged ``DO_NOT_USE``: NaN, the value that the formula gives
-            (NaN still in an undetermined pixel), or the mean of the nearest good pixels around.
+            (NaN still in an undetermined pixel, and the code 0 of a table of words), or the mean of
+            the nearest good pixels around.
+        exact : bool
+            Whether to invert the curves of a response to levels, of orders 2 and 3, exactly, some
+            20 times slower, with the slope at the end of the valid range beyond it. The cubic
+            differs by at most `inverse_error`. Other corrections have no curves to invert.
         out : ndarray, optional
             Array for the result, of the frames' shape, float32 or float64; for frames of 8 or 16
-            bits and float32 also uint8 or uint16, which hold no NaN, so they need another
-            `flagged`: values are rounded half to even, and limited to the range of the type
-            (`equipix.Corrector` counts such values).
+            bits and float32, unless `exact` or of a table of words, also uint8 or uint16, which
+            hold no NaN, so they need another `flagged`: values are rounded half to even, and
+            limited to the range of the type (`equipix.Corrector` counts such values).
 
         Returns
         -------
         ndarray, of the frames' shape
-            Of dtype float64 for float64 frames, else float32; or `out`.
+            Of dtype float64 for float64 frames, else float32; or `out`. Values outside of the valid
+            range of a response are extrapolated: see its `extrapolated`.
 
         Raises
         ------
         InputError
             If a shape does not fit, `dark` is "stored" and one is needed or another than "stored"
-            and none can be taken, `flagged` is unknown, or frames are of another bit depth than the
-            sensor: `out` is then of no use.
+            and none can be taken, `flagged` is unknown, `exact` is set without curves, or frames
+            are of another bit depth than the sensor: `out` is then of no use.
         """
-        return apply(self, frames, dark, flagged, out)
+        with naming_memory("correcting"):
+            raw = checked_frames(frames, self.shape)
+            formula = self._formula(dark, exact)
+            result = _result(raw, out, flagged, whole=formula is None and raw.dtype in FAST)
+            if formula is None:
+                double = not {raw.dtype, result.dtype} <= {*FAST}
+                prepared = _prepared(self, dark, flagged, double=double)
+            else:
+                same = np.broadcast_to(np.array([0.0, 1.0])[:, None, None], (2, *self.shape))
+                prepared = Prepared(self, same, flagged, double=True)
+            prepared.write(raw, result, formula)
+        return result
 
-    @property
-    def _planes(self: Correction) -> Array:
-        """The coefficients, not rounded to single precision."""
-        return self.coefficients
+    def _formula(self, _dark: Dark, exact: bool, /) -> Formula | None:
+        """What gives a corrected frame, float64, of one of shape (rows, cols) by no coefficients.
+
+        A result of another dtype than float32 or float64 is then refused.
+        """
+        if exact:
+            raise InputError("'exact' is True, but only a Response has curves: leave it out")
+        return None
+
+    def _planes(self: Correction, dtype: DTypeLike) -> Array:
+        """The coefficients, rounded to a dtype from double precision."""
+        return np.asarray(self.coefficients, dtype)
 
 
 class RawCorrection(CorrectionBase):
@@ -198,39 +224,14 @@ class RawCorrection(CorrectionBase):
     limits: ClassVar[None] = None
 
 
-def apply(
-    correction: Any,
-    frames: ArrayLike,
-    dark: Dark,
-    flagged: Flagged,
-    out: Array | None,
-    formula: Formula | None = None,
-) -> Array:
-    """Correct frames by coefficients, or by a formula that is none; see `CorrectionBase.correct`.
-
-    A formula gives the corrected frame, float64, of a frame of shape (rows, cols); `out` is then
-    float32 or float64.
-    """
-    with naming_memory("correcting"):
-        raw = checked_frames(frames, correction.shape)
-        result = _result(raw, out, flagged, whole=formula is None and raw.dtype in FAST)
-        if formula is None:
-            double = not {raw.dtype, result.dtype} <= {*FAST}
-            prepared = _prepared(correction, dark, flagged, double=double)
-        else:
-            same = np.stack([np.zeros(correction.shape), np.ones(correction.shape)])
-            prepared = Prepared(correction, same, flagged, double=True)
-        prepared.write(raw, result, formula)
-    return result
-
-
 def _prepared(correction: Any, dark: Dark, flagged: Flagged, *, double: bool) -> Prepared:
     """Prepare coefficients, or take those of the last call: a dark of the caller may change."""
     key, stays = (flagged, double, dark is None), dark is None or is_stored(dark)
     last: tuple[Any, Prepared] | None = getattr(correction, "_last", None)
     if stays and last is not None and last[0] == key:
         return last[1]
-    made = Prepared(correction, with_dark(correction, dark)._planes, flagged, double=double)
+    planes = with_dark(correction, dark)._planes(_DOUBLE if double else FAST[-1])
+    made = Prepared(correction, planes, flagged, double=double)
     if stays:
         object.__setattr__(correction, "_last", (key, made))
     return made

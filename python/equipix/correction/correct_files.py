@@ -11,7 +11,7 @@ from equipix._check import Array, Display, Flagged, OutputType, Progress
 from equipix.correction.apply import FAST, Corrector, output_dtype, usual_treatment
 from equipix.correction.protocol import Correction, Dark, refuse_dark
 from equipix.errors import FileError, InputError
-from equipix.findings import Finding, say, usable
+from equipix.findings import Finding, Findings, say, usable
 from equipix.io.formats import raw_headers
 from equipix.io.frames import Header, stream_frames
 from equipix.io.paths import find_files, folder_beside, refuse_inputs, write_whole
@@ -43,6 +43,8 @@ class Corrected(NamedTuple):
         Pixels that were replaced in each frame.
     flagged : int
         Pixels flagged ``DO_NOT_USE`` that became NaN in each frame; black in pictures.
+    findings : tuple of Finding
+        What limits the frames, each also a warning.
     """
 
     dtype: str
@@ -51,6 +53,7 @@ class Corrected(NamedTuple):
     extrapolated: int | None
     replaced: int
     flagged: int
+    findings: Findings
 
 
 def correct_files(
@@ -111,8 +114,8 @@ def correct_files(
     Raises
     ------
     FileError
-        If a file cannot be read or written, two outputs would have the same name, or one would
-        replace an input.
+        If a file cannot be read or written, an input is named twice, two outputs would have the
+        same name, or one would replace an input.
     InputError
         If the frames have another shape than the correction, it takes no other dark frame, or more
         than one frame would go to a .png, or floating-point numbers.
@@ -128,12 +131,13 @@ def correct_files(
     """
     wanted = _dtype(output, dtype, bit_depth, display)
     files = find_files(source)
+    refuse_inputs(files, [], "is named twice: name each input once")
     outputs = _outputs(output, files)
     refuse_inputs(outputs, files)
     headers = raw_headers(files, correction.shape)
     total, done = sum(header.shape[0] for header in headers.values()), 0
     _refuse_pictures(output, total, wanted)
-    warn_of_corrected(headers, origin)
+    said = warn_of_corrected(headers, origin)
     flagged = usual_treatment(wanted) if flagged is None else flagged
     of_dark = _dark(correction, dark)
     corrector = Corrector(
@@ -147,10 +151,10 @@ def correct_files(
     )
 
     def corrected(inputs: list[Path]) -> Iterator[NDArray[Any]]:
-        nonlocal done
+        nonlocal done, said
         for _, frames in stream_frames(inputs):
             if done == 0:
-                _warn_of_dark(frames[0], correction, of_dark)
+                said += _warn_of_dark(frames[0], correction, of_dark)
             native = frames.dtype.newbyteorder("=")
             taken = frames.astype(native if native in FAST else np.float32, copy=False)
             for frame in corrector.apply(taken):
@@ -173,10 +177,9 @@ def correct_files(
             for path in outputs:
                 (folder / path.name).replace(path)
     bad = int(np.count_nonzero(~usable(correction.flags))) if flagged == "nan" else 0
-    _warn_of_limited(corrector.clipped, total * correction.flags.size, wanted)
-    return Corrected(
-        wanted.name, total, corrector.clipped, corrector.extrapolated, corrector.replaced, bad
-    )
+    said += _warn_of_limited(corrector.clipped, total * correction.flags.size, wanted)
+    counts = corrector.clipped, corrector.extrapolated, corrector.replaced, bad
+    return Corrected(wanted.name, total, *counts, said)
 
 
 def _dtype(
@@ -239,11 +242,11 @@ def _outputs(output: Path, files: list[Path]) -> list[Path]:
     return [output / name for name in names]
 
 
-def warn_of_corrected(headers: Mapping[Path, Header], origin: str) -> None:
+def warn_of_corrected(headers: Mapping[Path, Header], origin: str) -> Findings:
     """Warn of files whose text this module has written; `origin` as for `correct_files`."""
     corrected = [file for file, each in headers.items() if each.description.startswith(_MARK)]
     if not corrected:
-        return
+        return ()
     others = f" and {len(corrected) - 1} more" if len(corrected) > 1 else ""
     same = bool(origin) and headers[corrected[0]].description.endswith(origin)
     by = "by this correction" if same else "by another correction"
@@ -251,14 +254,14 @@ def warn_of_corrected(headers: Mapping[Path, Header], origin: str) -> None:
         f"{corrected[0]}{others}: corrected already, {by}; what both remove is removed twice: give "
         "the raw frames"
     )
-    say(Finding("corrected", words, "input"))
+    return say(Finding("corrected", words, "input"))
 
 
-def _warn_of_dark(frame: NDArray[Any], correction: Correction, dark: Dark) -> None:
+def _warn_of_dark(frame: NDArray[Any], correction: Correction, dark: Dark) -> Findings:
     """Warn of a frame from which the dark was probably subtracted before."""
     given = correction.dark if isinstance(dark, str) else dark
     if given is None:
-        return
+        return ()
     offset = np.asarray(given.mean if isinstance(given, FrameStatistics) else given)
     level, below = np.nanmedian(offset), np.nanmedian(offset - frame)
     if level > 0 and below > DARKER * level:
@@ -266,13 +269,14 @@ def _warn_of_dark(frame: NDArray[Any], correction: Correction, dark: Dark) -> No
             f"the first frame is darker than the dark by {below:.4g} of {level:.4g} DN in the "
             "median: give raw frames, or 'dark' (--dark) none if the dark was subtracted from them"
         )
-        say(Finding("bright_dark", words, "input"))
+        return say(Finding("bright_dark", words, "input"))
+    return ()
 
 
-def _warn_of_limited(limited: int, values: int, dtype: np.dtype[Any]) -> None:
+def _warn_of_limited(limited: int, values: int, dtype: np.dtype[Any]) -> Findings:
     """Warn where most values are outside of the range of the output."""
     if limited <= values / 2:
-        return
+        return ()
     remedy = "float32, or more bits in 'bit_depth' (--bit-depth)"
     if dtype == np.uint8:
         remedy = "uint16; or 'display' (--display linear), which scales frames to 8 bits"
@@ -280,7 +284,7 @@ def _warn_of_limited(limited: int, values: int, dtype: np.dtype[Any]) -> None:
         f"{limited / values:.0%} of the corrected values were limited to the range of {dtype}: "
         f"choose 'dtype' (--dtype) {remedy}"
     )
-    say(Finding("limited", words, "input"))
+    return say(Finding("limited", words, "input"))
 
 
 def _dark(correction: Correction, dark: str) -> Dark:

@@ -10,7 +10,7 @@ from equipix.correction.apply import RawCorrection
 from equipix.correction.protocol import Correction, check_correction, sensor_table
 from equipix.errors import InputError
 from equipix.findings import Finding
-from equipix.io.record import Counts, Record
+from equipix.io.record import Counts, Record, made
 
 _MOST = 4
 """Most coefficients that the compiled part applies."""
@@ -84,7 +84,7 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     -------
     Polynomial
         Of the order of `first`, with its level of saturation and the flags of both; `metadata`
-        holds that of both, and what is known of the sensor.
+        holds that of both, versions and time, and what is known of the sensor.
 
     Raises
     ------
@@ -134,7 +134,7 @@ def combine(first: Correction, then: Correction) -> Polynomial:
         )
     coefficients = np.asarray(first.coefficients, np.float64) * gain
     coefficients[0] += after[0]
-    metadata: dict[str, Any] = {"first": first.metadata, "then": then.metadata}
+    metadata = made(first=first.metadata, then=then.metadata)
     if sensor:
         metadata["sensor"] = sensor
     flags, findings = first.flags | then.flags, first.findings + then.findings

@@ -10,12 +10,14 @@ from equipix.exposures.exposures import Exposures
 from equipix.exposures.positions import whole_moves
 from equipix.findings import Flag, usable
 from equipix.fitting.error_bars import fits_noise
+from equipix.measured.statistics import FEWEST_USABLE, SATURATED
 
-_LEAST = 0.5
-"""Least share of the pixels not masked by the caller that a calibration must determine."""
-
-_LARGEST_ERROR = 1.0
+FAR = 1.0
 """Largest estimated relative error of M: above it, M is not determined to its first digit."""
+
+_OFF_LINE = 0.5
+"""Root of the sum of squares of distances from a line, in pixels, up to which positions lie on it.
+"""
 
 _FEWEST = 3
 """Fewest exposures that compare pixels along both axes."""
@@ -26,6 +28,12 @@ TOO_WEAK = (
     "light or more frames, mask pixels that receive almost no light, and see that the shifts are "
     "those of the frames"
 )
+
+
+def why_weak(exposures: Exposures) -> str:
+    """Return why a fit does not come near its minimum: the positions, or else the light."""
+    cause = _uncompared(exposures)
+    return f"the positions do not determine the sensitivity, since {cause}" if cause else TOO_WEAK
 
 
 def left_out(fit: Fit) -> str:
@@ -44,15 +52,15 @@ def too_far(evidence: Evidence) -> str | None:
     """Say that the fit ended so far from its minimum that it determines no pixel."""
     fit = evidence.fit
     error = float(fit.error_estimate[-1])
-    if error <= _LARGEST_ERROR:  # a NaN is not
+    if error <= FAR:  # a NaN is not
         return None
     more = "use larger shifts in a beam with more structure"
     if fit.ended == "sweeps used":
         more = f"allow more sweeps, or {more}"
     return (
         "the fit ended far from its minimum, and determines no pixel (estimated relative error "
-        f"{error:.1e}, limit {_LARGEST_ERROR:g}): "
-        f"{TOO_WEAK if fits_noise(fit) else more}{left_out(fit)}"
+        f"{error:.1e}, limit {FAR:g}): "
+        f"{why_weak(evidence.exposures) if fits_noise(fit) else more}{left_out(fit)}"
     )
 
 
@@ -61,11 +69,11 @@ def too_few(evidence: Evidence) -> str | None:
     wanted = _wanted(evidence.exposures)
     determined = usable(evidence.flags) & wanted
     count, total = int(determined.sum()), int(wanted.sum())
-    if count >= _LEAST * total:
+    if count >= FEWEST_USABLE * total:
         return None
     return (
-        f"the exposures determine only {count} of {total} unmasked pixels (limit {_LEAST:.0%}): "
-        f"{_cause(evidence, wanted & ~determined)}"
+        f"the exposures determine only {count} of {total} unmasked pixels (limit "
+        f"{FEWEST_USABLE:.0%}): {_cause(evidence, wanted & ~determined)}"
     )
 
 
@@ -84,10 +92,7 @@ def _cause(evidence: Evidence, missing: Bools) -> str:
     """Return what most of the missing pixels have in common, and the remedy."""
     exposures, flags = evidence.exposures, evidence.flags
     if _most(missing, exposures.bad_pixels.saturated):
-        return (
-            "most of the others reach the saturation level: expose less, or correct the level "
-            "('saturation', 'bit_depth')"
-        )
+        return f"most of the others reach the saturation level: {SATURATED}"
     if _most(missing, (flags & (Flag.DEAD | Flag.HOT)) != 0):
         return (
             "most of the others count as dead, hot or noisy: check the dark frames, and the gain "
@@ -105,22 +110,31 @@ def _most(missing: Bools, found: Bools | None) -> bool:
 
 def _cause_in_shifts(exposures: Exposures, components: int) -> str:
     """Return why the shifts leave pixels unconnected."""
-    shifts, count = exposures.positions.shifts, len(exposures)
-    away = shifts - shifts[0]
-    turned = exposures.positions.are_turned
     result = f"the shifts leave {components} parts of the sensor unconnected"
-    if not away.any() and not turned:
-        return f"{result}, since they are all alike: move the sensor between exposures"
-    if count < _FEWEST:
-        return (
-            f"{result}, since {count} exposures compare pixels along one direction only: take at "
-            f"least {_FEWEST}, at positions that do not lie on one line"
-        )
-    if not turned and np.linalg.matrix_rank(away) < 2 <= min(exposures.shape):
-        return f"{result}, since they lie on one line: move the sensor along the other axis too"
+    if cause := _uncompared(exposures):
+        return f"{result}, since {cause}"
     if _mask_separates(exposures):
         return f"{result}, since pixels between them are masked or missing: use shorter shifts"
     return f"{result}: choose other shifts, see equipix.plan.identify"
+
+
+def _uncompared(exposures: Exposures) -> str | None:
+    """Say why positions do not compare pixels along both axes, and the remedy; None where they do.
+
+    Measured positions of one line scatter about it.
+    """
+    shifts, turned = exposures.positions.shifts, exposures.positions.are_turned
+    if not np.ptp(shifts, axis=0).any() and not turned:
+        return "they are all alike: move the sensor between exposures"
+    if len(exposures) < _FEWEST:
+        return (
+            f"{len(exposures)} exposures compare pixels along one direction only: take "
+            f"at least {_FEWEST}, at positions that do not lie on one line"
+        )
+    rank = np.linalg.matrix_rank(shifts - shifts[0], _OFF_LINE)
+    if not turned and rank < 2 <= min(exposures.shape):
+        return "they lie on one line: move the sensor along the other axis too"
+    return None
 
 
 def _mask_separates(exposures: Exposures) -> bool:
@@ -129,4 +143,4 @@ def _mask_separates(exposures: Exposures) -> bool:
     whole = whole_moves(exposures.positions.shifts)
     _, counts, _ = _native.planned_components(exposures.shape, whole, rotation=rotation, mask=None)
     rows, cols = exposures.shape
-    return max(counts) >= _LEAST * rows * cols
+    return max(counts) >= FEWEST_USABLE * rows * cols

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from equipix.diagnosis.coverage import TOO_WEAK, left_out, too_far, too_few
+from equipix.diagnosis.coverage import left_out, too_far, too_few, why_weak
 from equipix.diagnosis.evidence import Evidence
 from equipix.diagnosis.small_errors import small_errors_found
 from equipix.findings import Rule
@@ -142,7 +142,7 @@ def _on_convergence(e: Evidence) -> str | None:
     if fit.ended == "converged":
         return None
     if fits_noise(fit):
-        remedy = f": {TOO_WEAK}"
+        remedy = f": {why_weak(e.exposures)}"
     elif fit.ended == "sweeps used":
         remedy = ": allow more sweeps"
     else:

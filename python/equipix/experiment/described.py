@@ -10,20 +10,11 @@ from typing import Any, ClassVar, Generic, Self, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from equipix._check import (
-    EXPOSURES,
-    Bools,
-    Progress,
-    Words,
-    as_mask,
-    naming_memory,
-    staged,
-    union,
-)
+from equipix._check import EXPOSURES, Bools, Progress, Words, as_mask, naming_memory, staged, union
 from equipix.errors import FileError, InputError
 from equipix.experiment.image_files import check_formats, image_files, refuse_repeats, sha256_of
 from equipix.experiment.manifest import Dark, LevelManifest, Manifest, entry_files, read_manifest
-from equipix.io.frames import read_mask
+from equipix.io.formats import read_mask
 from equipix.io.paths import as_path
 from equipix.measured.average import average
 from equipix.measured.colour import Colours

@@ -88,21 +88,25 @@ def refuse_repeats(
             )
 
 
-def refuse_repeated_files(frames: list[Path], dark: list[Path]) -> None:
-    """Refuse a file that is averaged twice, by its name or its content, or as its own dark.
+def refuse_repeated_files(frames: list[Path], dark: list[Path]) -> dict[Path, str]:
+    """Refuse a file that is averaged twice, or as its own dark; return the hashes of all.
+
+    A file is the same by its name or its content.
 
     Raises
     ------
     FileError
         With the file and where it stands.
     """
-    for hashes in (None, sha256_of(dict.fromkeys([*frames, *dark]))):
+    found = sha256_of([*frames, *dark])
+    for hashes in (None, found):
         for one, other in _alike(frames, frames, hashes):
             raise FileError(f"{_words(one, other)} twice in the frames: give each once")
         for one, other in _alike(frames, dark, hashes):
             raise FileError(
                 f"{_words(one, other)} in the frames and in 'dark': give each its own frames"
             )
+    return found
 
 
 def image_files(path: Path, manifest: Manifest | LevelManifest) -> list[Path]:
@@ -154,6 +158,12 @@ def raw_frames(files: Iterable[Path]) -> Array:
 def sha256_of(files: Iterable[Path]) -> dict[Path, str]:
     """Hashes of the content of files."""
     return {file: _sha256(file) for file in files}
+
+
+def with_inputs(metadata: dict[str, Any], hashes: Mapping[Path, str]) -> dict[str, Any]:
+    """Metadata with the hashes of files, beside those that they hold."""
+    named = {str(file): each for file, each in hashes.items()}
+    return {**metadata, "inputs": metadata.get("inputs", {}) | named}
 
 
 def _sha256(path: Path) -> str:

@@ -289,7 +289,8 @@ def read_manifest(path: Path, model: type[_Content]) -> _Content:
     except OSError as error:
         raise FileError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
-        raise FileError(f"{path}: is not a TOML file: {error}") from error
+        line = error.object.count(b"\n", 0, error.start) + 1
+        raise FileError(f"{path}: line {line} is no UTF-8: save it as UTF-8, as TOML is") from None
     except tomllib.TOMLDecodeError as error:
         raise FileError(f"{path}: is not valid TOML: {error}") from error
     try:

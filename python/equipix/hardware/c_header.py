@@ -102,12 +102,10 @@ def from_c_header(path: Path, data: bytes) -> Content:
     text = data.decode().replace("\r\n", "\n").rstrip()
     first = text.split("\n", 1)[0].rstrip()
     fields = read_header(path, first.removesuffix(" */"), _FIRST)
-    guard = re.search(r"^#ifndef (\w+)_H\s*$", text, re.MULTILINE)
+    guard = re.findall(r"^#ifndef (\w+)_H\s*$", text, re.MULTILINE)[0]
     above, newline, last = text.rpartition("\n")
-    if guard is None or not last.startswith(f"#endif /* {guard[1]}_H"):
-        raise FileError(f"{path}: has no last line '#endif' with its guard: incomplete")
-    content = made(path, fields, {name: _words(path, text, name) for name in DTYPES})
-    if last != _last(guard[1], above + newline):
+    content = made(path, fields, {name: _words(text, name) for name in DTYPES})
+    if last != _last(guard, above + newline):
         raise FileError(
             f"{path}: was edited, or its digest removed: the last line does not hold the SHA-256 "
             "of the lines above: write the table again"
@@ -115,10 +113,8 @@ def from_c_header(path: Path, data: bytes) -> Content:
     return content
 
 
-def _words(path: Path, text: str, name: str) -> Array:
+def _words(text: str, name: str) -> Array:
     """Words of one array."""
-    body = re.search(rf"_{name}\[\d+\] = {{\s*(.*?)}};", text, re.DOTALL)
-    if body is None:
-        raise FileError(f"{path}: has no words of '{name}': incomplete")
-    words = re.sub(r"\s", "", body[1]).rstrip(",").split(",")
+    body = re.findall(rf"_{name}\[\d+\] = {{\s*(.*?)}};", text, re.DOTALL)[0]
+    words = re.sub(r"\s", "", body).rstrip(",").split(",")
     return np.array([int(word) for word in words], np.int64)

@@ -1,5 +1,6 @@
 """How much quality C the words of a table cost, and which widths suffice."""
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import takewhile
@@ -9,7 +10,7 @@ import numpy as np
 
 from equipix._check import Array, ArrayLike, as_array, naming_memory, positive
 from equipix.correction.protocol import Correction
-from equipix.errors import InputError
+from equipix.errors import InputError, InputWarning
 from equipix.findings import usable
 from equipix.hardware.table import Table
 from equipix.metrics import correctability
@@ -68,6 +69,10 @@ def quality(correction: Correction, frames: ArrayLike, **options: Any) -> Qualit
     InputError
         As of `Table.of` and `equipix.metrics.correctability`.
 
+    Notes
+    -----
+    Of the table nothing is warned: what it costs is the result, and `Table.findings` has the rest.
+
     Examples
     --------
     >>> import equipix
@@ -82,7 +87,8 @@ def quality(correction: Correction, frames: ArrayLike, **options: Any) -> Qualit
     True
     """
     raw, exact, before = _level("frames", correction, frames)
-    table = Table.of(correction, **options)
+    with warnings.catch_warnings(action="ignore", category=InputWarning):  # what words cost is told
+        table = Table.of(correction, **options)
     words = table.digitise(raw)[:, usable(table.flags)]
     at_ends = int(np.count_nonzero((words == 0) | (words == table.format.largest_word)))
     _refuse_clipped(raw, table, words, at_ends)
@@ -161,7 +167,6 @@ def smallest_widths(
     sought = {"offset_bits", "gain_bits"} & set(options)
     if sought or not len(levels):
         raise InputError(f"{sorted(sought) or 'levels'}: expected levels, and no width of a memory")
-    Table.of(correction, offset_bits=_BOTH, gain_bits=_BOTH, **options)
     measured = [_level("levels", correction, frames) for frames in levels]
 
     def worst(offset_bits: int, gain_bits: int) -> float:
@@ -174,11 +179,13 @@ def smallest_widths(
             return float("inf")
         return max(_added(table.correct(raw), exact, before) for raw, exact, before in measured)
 
-    found = {
-        "offset": {bits: worst(bits, _BOTH) for bits in _WIDTHS},
-        "gain": {bits: worst(_BOTH, bits) for bits in _WIDTHS},
-        "both": {bits: worst(bits, bits) for bits in _WIDTHS},
-    }
+    with warnings.catch_warnings(action="ignore", category=InputWarning):
+        Table.of(correction, offset_bits=_BOTH, gain_bits=_BOTH, **options)
+        found = {
+            "offset": {bits: worst(bits, _BOTH) for bits in _WIDTHS},
+            "gain": {bits: worst(_BOTH, bits) for bits in _WIDTHS},
+            "both": {bits: worst(bits, bits) for bits in _WIDTHS},
+        }
     offset, gain, both = (_first(each, added) for each in found.values())
     return Widths(offset, gain, both, found)
 

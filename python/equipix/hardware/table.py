@@ -8,25 +8,23 @@ from typing import ClassVar, NamedTuple, Self
 import numpy as np
 
 from equipix import _native
-from equipix._check import (
-    Array,
-    ArrayLike,
-    Flagged,
-    Floats,
-    naming_memory,
-    number,
-    positive_workers,
-)
-from equipix.correction.apply import RawCorrection, apply, checked_frames, each_frame
+from equipix._check import Array, ArrayLike, Floats, naming_memory, number, positive_workers
+from equipix.correction.apply import Formula, RawCorrection, checked_frames, each_frame
 from equipix.correction.protocol import Correction, Dark, check_correction, with_dark
-from equipix.errors import FileError, InputError
-from equipix.findings import Finding, usable
+from equipix.errors import InputError
+from equipix.findings import Finding, say, usable
 from equipix.hardware import c_header, table_files
 from equipix.hardware.encode import Steps, encode, line_of, origin, refuse_far_offsets
 from equipix.hardware.table_files import Content
 from equipix.hardware.words import WIDTHS, check_width, chosen_exponent, exponent_of
-from equipix.io.paths import as_path, write_whole
+from equipix.io.paths import as_path, reading, write_whole
 from equipix.measured.colour import Colours
+
+_COARSE = 0.005
+"""Largest error of words, over the range of the ADC."""
+
+_KEPT = 0.99
+"""Least share of the raw values that the ADC must hold."""
 
 
 class Applied(NamedTuple):
@@ -153,6 +151,12 @@ class Table(RawCorrection, Content):
         InputError
             If a width or a step is out of range, the correction is curved, or words of usable
             pixels do not fit; the message has their number and the width that would hold them.
+
+        Warns
+        -----
+        InputWarning
+            If words are off by more than 0.5 % of the range of the ADC, or the ADC does not hold
+            the raw values of the sensor's bit depth, where the metadata have that.
         """
         check_correction("correction", correction)
         bits = zip(WIDTHS, (adc_bits, dac_bits, offset_bits, gain_bits, out_bits), strict=True)
@@ -171,13 +175,15 @@ class Table(RawCorrection, Content):
             line, sag = line_of(correction, linearise)
             found = encode(line, correction.flags, widths, steps, float(lowest))
             refuse_far_offsets(found, line, widths, steps, float(lowest))
-        colours = correction.colours
+        colours, source = correction.colours, origin(correction)
+        depth = correction.bits if source.get("sensor", {}).get("bit_depth") else 0
+        said = say(*_limits(found, depth))
         metadata = {
-            **origin(correction),
+            **source,
             **({} if colours is None else {"cfa": colours.rows}),
             **({"leaves_offset": True} if correction.leaves_offset else {}),
             **found.metadata,
-            "findings": [vars(each) for each in correction.findings],
+            "findings": [vars(each) for each in (*correction.findings, *said)],
         }
         if linearise is not None:
             metadata["linearised"] = {"raw": [float(each) for each in linearise], "sag_dn": sag}
@@ -195,7 +201,7 @@ class Table(RawCorrection, Content):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What limits the correction that it is of."""
+        """What limits the correction that it is of, and its words."""
         return tuple(Finding(**each) for each in self.metadata.get("findings", ()))
 
     @property
@@ -274,46 +280,16 @@ class Table(RawCorrection, Content):
         )
         return Applied(out, below, above)
 
-    def correct(
-        self,
-        frames: ArrayLike,
-        *,
-        dark: Dark = "stored",
-        flagged: Flagged = "nan",
-        out: Array | None = None,
-    ) -> Array:
-        """Raw frames as amplifier, ADC and table correct them, in DN.
-
-        Parameters
-        ----------
-        frames : array_like, shape (rows, cols) or (n, rows, cols)
-            Raw frames in DN, as without the DAC.
-        dark : "stored"
-            No other: the offsets are words of the table.
-        flagged : {"nan", "keep", "replace"}
-            The value of pixels flagged ``DO_NOT_USE``: NaN, the code 0, or the mean of the nearest
-            good pixels around.
-        out : ndarray, optional
-            Array for the result, of the frames' shape, float32 or float64.
-
-        Returns
-        -------
-        ndarray, of the frames' shape
-            Of dtype float64 for float64 frames, else float32; or `out`.
-
-        Raises
-        ------
-        InputError
-            If a shape does not fit, `flagged` is unknown, a usable pixel is not finite, or frames
-            are of another bit depth than the sensor.
-        """
+    def _formula(self, dark: Dark, exact: bool, /) -> Formula:
+        """Amplifier, ADC and table, in DN: the offsets are words, so no other dark is taken."""
         with_dark(self, dark)
+        super()._formula(dark, exact)
 
         def formula(frame: Array) -> Array:
             words = self.apply(self.digitise(frame))
             return np.ldexp(self.format.zero + words.astype(np.float64), self.format.out)
 
-        return apply(self, frames, dark, flagged, out, formula)
+        return formula
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Write to a file that `equipix.load` reads bit by bit.
@@ -339,6 +315,25 @@ class Table(RawCorrection, Content):
             temporary.write_bytes(data)
 
 
+def _limits(made: Content, depth: int) -> tuple[Finding, ...]:
+    """Say what words lose of a correction, of a sensor of so many bits; 0 if that is not known."""
+    f, error = made.format, made.metadata["largest_error_dn"]
+    full = 2.0 ** (f.adc_bits + f.adc)
+    end = full + float(np.mean(made.coarse)) * 2.0**f.coarse
+    coarse = (
+        f"the words differ from the correction by up to {error:.3g} DN, {error / full:.1%} of the "
+        f"range of the ADC (limit {_COARSE:.1%}): leave out 'gain_step' and 'offset_step', or take "
+        "more 'gain_bits' and 'offset_bits'"
+    )
+    beyond = (
+        f"the range of the ADC ends at {end:g} DN, and {1 - end / 2**depth:.0%} of the raw values "
+        f"of {depth} bits are beyond it: they become the word {f.largest_word}: take 'adc_bits' "
+        f"{depth}, or 'adc_step' {2.0 ** (depth - f.adc_bits):g}"
+    )
+    found = ("words", coarse, error > _COARSE * full), ("range", beyond, end < _KEPT * 2**depth)
+    return tuple(Finding(kind, words, "input") for kind, words, is_so in found if is_so)
+
+
 _FORMATS = {
     ".bin": (table_files.to_binary, table_files.from_binary),
     ".hex": (table_files.to_memory_image, table_files.from_memory_image),
@@ -360,14 +355,8 @@ def read_table(path: str | PathLike[str]) -> Table:
     """
     file = as_path("path", path)
     _, decode_file = _FORMATS[_suffix(file)]
-    try:
+    with reading(file):
         return Table(**vars(decode_file(file, file.read_bytes())))
-    except FileError:
-        raise
-    except OSError as error:
-        raise FileError(f"{file}: cannot be read: {error}") from error
-    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        raise FileError(f"{file}: is damaged or incomplete: {error}") from error
 
 
 def _suffix(path: Path) -> str:

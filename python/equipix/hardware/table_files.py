@@ -29,7 +29,7 @@ from equipix.hardware.words import Format
 NEWEST = 1
 """Format number of the files that this version writes."""
 
-_FOREIGN = "holds no table that equipix has written"
+_FOREIGN = "holds no table that equipix has written in the format of its name: name such a file"
 
 DTYPES = {"coarse": np.uint16, "offset": np.int16, "gain": np.uint16, "flags": np.uint32}
 """Type of each array, in the order of the files."""
@@ -171,8 +171,6 @@ def from_binary(path: Path, data: bytes) -> Content:
     """Parse the bytes of a file."""
     if data[:4] != _MAGIC:
         raise FileError(f"{path}: {_FOREIGN}")
-    if len(data) < _FIXED:
-        raise FileError(f"{path}: holds {len(data)} bytes, less than the header: incomplete")
     start = _FIXED + int(_LENGTH.unpack_from(data, len(_MAGIC))[0])
     fields = read_header(path, data[_FIXED:start].decode())
     size, stored = int(fields["rows"]) * int(fields["cols"]), _stored(Format(**fields["format"]))
@@ -228,8 +226,6 @@ def from_memory_image(path: Path, data: bytes) -> Content:
     parts = [line.partition("//") for line in lines if not line.startswith("//")]
     packed = np.array([int(word, 16) for word, _, _ in parts], np.int64)
     flags = np.array([int(flags or "0", 16) for _, _, flags in parts], np.int64)
-    if np.any(packed >= 2 ** sum(f.stored.values())):
-        raise FileError(f"{path}: holds words wider than its header says")
     offset = packed >> f.gain_bits & (2**f.offset_bits - 1)
     arrays: dict[str, Array] = {
         "coarse": packed >> (f.offset_bits + f.gain_bits),

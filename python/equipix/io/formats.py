@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from equipix._check import Array
+from equipix._check import Array, Bools
 from equipix.errors import FileError, InputError
 from equipix.io import fits, tiff
-from equipix.io.frames import Header, frame_format, header, suffix_of
+from equipix.io.frames import Header, frame_format, header, read_frames, suffix_of
 from equipix.io.paths import as_path, reading, write_whole
 from equipix.io.viewed import Viewed
 
@@ -184,10 +184,10 @@ def refuse_saved(path: Path) -> None:
     _refuse_kind(path, saved_kind(path))
 
 
-def _refuse_kind(path: Path, kind: str | None) -> None:
+def _refuse_kind(path: Path, kind: str | None, wanted: str = "raw frames") -> None:
     if kind is not None:
         article = "" if kind.endswith("s") else "a "
-        raise FileError(f"{path}: holds {article}{kind}, expected raw frames")
+        raise FileError(f"{path}: holds {article}{kind}, expected {wanted}")
 
 
 def raw_headers(files: Iterable[Path], shape: tuple[int, int]) -> dict[Path, Header]:
@@ -206,3 +206,39 @@ def raw_header(path: Path) -> Header:
     found = header(path)
     _refuse_kind(path, _kind(found.description) if found.dtype.kind == "f" else None)
     return found
+
+
+def read_mask(path: str | PathLike[str]) -> Bools:
+    """Read which pixels must not be used: those that are not 0 in the file.
+
+    Parameters
+    ----------
+    path : path
+        One grey image (TIFF, PNG, PGM or BMP), or a NumPy array (.npy) of two dimensions.
+
+    Returns
+    -------
+    ndarray of bool, shape (rows, cols)
+        True = do not use.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read or holds no single image.
+    """
+    file = as_path("mask", path)
+    _refuse_kind(file, saved_kind(file), "a mask, an image or .npy: 0 in usable pixels")
+    array = _array(file) if file.suffix.lower() == ".npy" else read_frames(file)
+    if array.ndim == 3 and len(array) == 1:
+        array = array[0]
+    if array.ndim != 2 or array.dtype.kind not in "buif":
+        raise FileError(
+            f"{file}: holds {array.dtype} of shape {array.shape}, expected one mask of shape "
+            "(rows, cols), in which pixels that are not 0 must not be used"
+        )
+    return np.asarray(array != 0)
+
+
+def _array(file: Path) -> Array:
+    with reading(file):
+        return np.asarray(np.load(file, allow_pickle=False))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from equipix import _native
 from equipix.errors import FileError, UnsupportedFileError
 from equipix.io import arrays, fits, png, tiff
-from equipix.io.paths import as_path, find_files, reading
+from equipix.io.paths import find_files, reading
 
 _AT_ONCE = 2**27
 """Most bytes of a file of several frames that are read at once."""
@@ -142,42 +142,3 @@ def _frames(path: Path, workers: int | None) -> Iterator[NDArray[Any]]:
 
 def _format(frames: NDArray[Any]) -> str:
     return f"{frames.shape[-2]} x {frames.shape[-1]} (rows x columns), {frames.dtype}"
-
-
-def read_mask(path: str | PathLike[str]) -> NDArray[np.bool_]:
-    """Read which pixels must not be used: those that are not 0 in the file.
-
-    Parameters
-    ----------
-    path : path
-        One grey image (TIFF, PNG, PGM or BMP), or a NumPy array (.npy) of two dimensions.
-
-    Returns
-    -------
-    ndarray of bool, shape (rows, cols)
-        True = do not use.
-
-    Raises
-    ------
-    FileError
-        If the file cannot be read or holds no single image.
-    """
-    file = as_path("mask", path)
-    array = _array(file) if file.suffix.lower() == ".npy" else read_frames(file)
-    if array.ndim == 3 and len(array) == 1:
-        array = array[0]
-    if array.ndim != 2 or array.dtype.kind not in "buif":
-        raise FileError(
-            f"{file}: holds {array.dtype} of shape {array.shape}, expected one mask of shape "
-            "(rows, cols), in which pixels that are not 0 must not be used"
-        )
-    mask: NDArray[np.bool_] = array != 0
-    return mask
-
-
-def _array(file: Path) -> NDArray[Any]:
-    with reading(file), file.open("rb") as stream:
-        if stream.read(6) != np.lib.format.MAGIC_PREFIX:
-            raise FileError(f"{file}: is no .npy file, whatever its name says")
-        stream.seek(0)
-        return np.asarray(np.load(stream, allow_pickle=False))

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from os import PathLike
 from pathlib import Path
 
-from equipix.errors import EquipixError, FileError, InputError
+from equipix.errors import EquipixError, FileError, InputError, InsufficientMemoryError
 from equipix.io.arrays import ZARR, split
 
 
@@ -83,8 +83,11 @@ def as_path(name: str, value: object) -> Path:
     return Path(text)
 
 
-def refuse_inputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
-    """Refuse an output that is also an input, or another output.
+_TWO = "is named for two outputs: name another for one of them"
+
+
+def refuse_inputs(outputs: Iterable[Path], inputs: Iterable[Path], twice: str = _TWO) -> None:
+    """Refuse an output that is also an input, or another output, which `twice` says of it.
 
     Raises
     ------
@@ -97,7 +100,7 @@ def refuse_inputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
         if path.resolve() in taken:
             raise FileError(f"{path}: is one of the inputs: name another output")
         if path.resolve() in named:
-            raise FileError(f"{path}: is named for two outputs: name another for one of them")
+            raise FileError(f"{path}: {twice}")
         named.add(path.resolve())
 
 
@@ -109,13 +112,15 @@ def reading(path: Path) -> Iterator[None]:
     logger.addHandler(complaints)
     try:
         yield
-    except EquipixError:
+    except (FileError, InsufficientMemoryError):
         raise
     except FileNotFoundError as error:
         raise FileError(f"{path}: does not exist") from error
     except Exception as error:
-        hint = "; pip install 'equipix[codecs]'" if "imagecodecs" in str(error) else ""
-        raise FileError(f"{path}: cannot be read: {error}{hint}") from error
+        broken = f"incomplete, damaged, or no {path.suffix} file: use a copy, or make it again"
+        codecs = f"{error}; pip install 'equipix[codecs]'" if "imagecodecs" in str(error) else ""
+        why = codecs or getattr(error, "strerror", None) or broken
+        raise FileError(f"{path}: cannot be read: {why}") from error
     finally:
         logger.removeHandler(complaints)
     if complaints.messages:
@@ -206,7 +211,8 @@ def _temporary(target: Path) -> Iterator[Path]:
     except EquipixError:
         raise
     except OSError as error:
-        raise FileError(f"{target}: cannot be written: {error}") from error
+        why = error.strerror or error  # without the name of the temporary file
+        raise FileError(f"{target}: cannot be written: {why}: name another folder") from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
         with suppress(OSError):

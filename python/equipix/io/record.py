@@ -23,6 +23,7 @@ import math
 import typing
 import zlib
 from collections.abc import Callable
+from datetime import UTC, datetime
 from functools import cache
 from os import PathLike
 from types import NoneType, UnionType
@@ -55,6 +56,17 @@ _NOT_FINITE = ("nan", "inf", "-inf")
 
 _PLAIN: dict[Any, Any] = {bool: bool, int: int, float: (float, int), str: str}
 """Types of the JSON values of an annotation."""
+
+
+def now() -> str:
+    """Time for the metadata."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def made(**known: Any) -> dict[str, Any]:
+    """Metadata of a result that is made now: versions, what else is known, and the time."""
+    versions = {"equipix": __version__, "numpy": np.__version__}
+    return {"versions": versions, **known, "finished": now()}
 
 
 class Record(Shown, ReadOnly):

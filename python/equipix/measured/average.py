@@ -26,7 +26,7 @@ from equipix._check import (
 from equipix.errors import FileError, InputError, UnsupportedFileError
 from equipix.io.frames import frame_format, is_image, stream_frames
 from equipix.io.paths import find_files
-from equipix.io.record import read_record
+from equipix.io.record import made, now, read_record
 from equipix.measured.saturation import level_of
 from equipix.measured.statistics import FrameStatistics, _masked, _step, _subtract, saved_shape
 from equipix.measured.stream import Rejection, batches, sum_dtype, unmasked
@@ -78,7 +78,7 @@ def average(
     Raises
     ------
     InputError
-        If an argument has a wrong shape or value.
+        If an argument has a wrong shape or value, or no frame holds a finite number.
     FileError
         If a file is missing, broken, in colour, or differs from the first in shape or depth.
     InsufficientMemoryError
@@ -113,6 +113,7 @@ def average(
     >>> result.mean, result.variance
     (array([[2., 2.]]), array([[2., 0.]]))
     """
+    started = now()
     offset = dark if isinstance(dark, FrameStatistics | None) else as_floats("dark", dark, ndim=2)
     how = _How(
         as_level(saturation),
@@ -127,7 +128,13 @@ def average(
             statistics = _average_files(taken, how)
         else:
             statistics = _average_batches(batches(taken), how, operator.length_hint(frames))
-        return _masked(_subtract(statistics, offset), as_mask(mask, statistics.mean.shape))
+        if not statistics.count.any():
+            raise InputError("'frames' holds no finite number: give frames with numbers")
+        options = {"saturation": how.level, "reject": statistics.reject}
+        # A saved average brings its own.
+        metadata = statistics.metadata or made(options=options, started=started)
+        found = dataclasses.replace(_subtract(statistics, offset), metadata=metadata)
+        return _masked(found, as_mask(mask, found.mean.shape))
 
 
 class _How(NamedTuple):

@@ -512,4 +512,4 @@ class DefectLimits:
         """Refuse limits that are not above 0."""
         for name, value in vars(self).items():
             if not number(name, value) > 0:
-                raise InputError(f"'{name}' is {value!r}, expected a number above 0")
+                raise InputError(f"'{name}' (--{name}-limit) is {value!r}, expected more than 0")

@@ -175,6 +175,10 @@ def averaged_of(frames: object, words: Words, colours: Colours | None) -> Averag
     """Statistics of all exposures, reduced; None for arrays."""
     if isinstance(frames, Averaged):
         return frames
+    if isinstance(frames, FrameStatistics):
+        raise InputError(
+            f"{words.argument} is one FrameStatistics, expected a list: one for each {words.one}"
+        )
     if not isinstance(frames, list | tuple):
         return None
     statistics = [each for each in frames if isinstance(each, FrameStatistics)]
@@ -274,10 +278,11 @@ def _noise_of(
     if len(shape) == 1:
         check_count("variance", len(numbers), len(values), words.one)
         return (), numbers.astype(np.float64)
-    if shape != values.shape:
+    if shape != values.shape or not words.pixel_variances:
+        others = values.shape if words.pixel_variances else "a NoiseModel"
         raise InputError(
             f"'variance' has shape {shape}, expected {(len(values),)}, one number for each "
-            f"{words.one}, or {values.shape}"
+            f"{words.one}, or {others}"
         )
     with np.errstate(over="ignore"):  # the solver refuses what becomes infinite
         return (), numbers.astype(values.dtype, copy=False)
@@ -289,8 +294,6 @@ _FURTHER = 5.0
 
 def check_levels(levels: object) -> None:
     """Refuse stacks of raw frames, and levels of several shapes, before they become one array."""
-    if isinstance(levels, FrameStatistics):
-        raise InputError("'levels' is one average, expected a list of them: one a level")
     arrays = levels if isinstance(levels, list | tuple) else [levels]
     if any(not hasattr(each, "dtype") and hasattr(each, "__next__") for each in arrays):
         raise InputError("'levels' holds iterators of frames: average each with equipix.average")

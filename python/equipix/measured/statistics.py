@@ -14,7 +14,7 @@ with the signals of the pixels that follow the light.
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ import numpy as np
 
 from equipix._check import Array, Floats, check_maps
 from equipix.errors import InputError
-from equipix.findings import Rule
+from equipix.findings import Finding, Rule
 from equipix.io.formats import refuse_saved, saved_kind
 from equipix.io.record import Counts, Doubles, Record, read_record
 from equipix.io.viewed import Viewed
@@ -37,7 +37,7 @@ DARKER = 0.25
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class FrameStatistics(Record, kind="frame statistics", version=2):
+class FrameStatistics(Record, kind="frame statistics", version=3):
     """Mean and scatter of repeated frames of one scene, as read-only arrays.
 
     `equipix.average`, experiment.toml and the command line take the file that `save` writes in the
@@ -73,6 +73,10 @@ class FrameStatistics(Record, kind="frame statistics", version=2):
         that of the light, and of the noise over the number of pixels. Where samples are missing it
         is that of their differences to the first values of their pixels. None of one frame, or
         where it is not known: a saved average does not show it without the pixels of another mask.
+    metadata : dict
+        Versions, options and times, as JSON values; ``equipix average`` adds the hashes of files.
+    findings : tuple of Finding
+        What limits the result, where it was asked, as ``equipix average`` does.
     """
 
     mean: Doubles
@@ -86,6 +90,8 @@ class FrameStatistics(Record, kind="frame statistics", version=2):
     reject: float | None = None
     step: float = 0.0
     light_variance: float | None = None
+    metadata: dict[str, Any] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse maps of different shapes."""
@@ -187,6 +193,22 @@ def _on_bright_dark(statistics: FrameStatistics) -> str | None:
     return None
 
 
+SATURATED = "expose less, or correct the level ('saturation', 'bit_depth', average --saturation)"
+"""What to do where most pixels reach the saturation level."""
+
+FEWEST_USABLE = 0.5
+"""Least share of the pixels that are not masked to measure with."""
+
+
+def _on_saturation(statistics: FrameStatistics) -> str | None:
+    """Say that less than half of the pixels are free of saturation."""
+    total, count = map(np.count_nonzero, (statistics.count, statistics.saturated))
+    if total - count >= FEWEST_USABLE * total:
+        return None
+    share = f"{count} of {total} unmasked pixels (limit {1 - FEWEST_USABLE:.0%})"
+    return f"{share} reach the saturation level of {statistics.saturation} DN: {SATURATED}"
+
+
 def _on_light(statistics: FrameStatistics) -> str | None:
     """Say that frames are of several levels of light."""
     light = light_of(statistics)
@@ -196,6 +218,7 @@ def _on_light(statistics: FrameStatistics) -> str | None:
 
 
 AVERAGED: tuple[Rule[FrameStatistics], ...] = (
+    Rule("saturation", "input", _on_saturation),
     Rule("bright_dark", "input", _on_bright_dark),
     Rule("light", "misfit", _on_light),
 )

@@ -36,7 +36,7 @@ def batches(frames: Array | Iterator[Any]) -> Iterator[Array]:
         frame = _frame(index, item)
         if _kind(frame) != _kind(first):
             raise InputError(
-                f"'source[{index}]' is {_kind(frame)}, expected {_kind(first)} like the first"
+                f"'frames[{index}]' is {_kind(frame)}, expected {_kind(first)} like the first"
             )
         batch[filled] = frame
         filled += 1
@@ -49,7 +49,7 @@ def batches(frames: Array | Iterator[Any]) -> Iterator[Array]:
 
 def _frame(index: int, item: Any) -> Array:
     """Check one frame of an iterable; a masked array stays one."""
-    name, masked = f"source[{index}]", isinstance(item, np.ma.MaskedArray)
+    name, masked = f"frames[{index}]", isinstance(item, np.ma.MaskedArray)
     frame = as_array(name, np.ma.getdata(item) if masked else item, ndim=2)
     return np.ma.array(frame, mask=np.ma.getmaskarray(item)) if masked else frame
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from equipix._check import ArrayLike, Bools, Floats, as_array, as_mask, naming_memory, number
 from equipix.errors import InputError
-from equipix.findings import ask, say
+from equipix.findings import Finding, ask, say
 from equipix.metrics.frame_noise import STEADY, signed_root, stack_of, temporal_of
 
 
@@ -28,6 +28,8 @@ class Correctability:
         Variance of one frame, drift of the frame mean removed.
     pixels, frames : int
         Numbers that count.
+    findings : tuple of Finding
+        What limits the result, each also a warning.
     """
 
     ratio: float
@@ -37,6 +39,7 @@ class Correctability:
     temporal_variance: float
     pixels: int
     frames: int
+    findings: tuple[Finding, ...] = ()
 
 
 @naming_memory("correctability")
@@ -115,7 +118,7 @@ def correctability(
     if not 0 < number("confidence", confidence) < 1:
         raise InputError(f"'confidence' is {confidence!r}, expected a number between 0 and 1")
     found = temporal_of(stack, as_mask(mask, stack.shape[1:]))
-    say(*ask(STEADY, found))
+    said = say(*ask(STEADY, found))
     n, pixels = found.frames, int(np.count_nonzero(found.used))
     if pixels < 2:
         raise InputError(f"'frames' has {pixels} pixels that are finite and not masked, expected 2")
@@ -130,7 +133,8 @@ def correctability(
     low, high = (
         signed_root((ratio / _fisher_quantile(p, *degrees) - 1) / n) for p in (1 - tail, tail)
     )
-    return Correctability(signed_root(spatial / temporal), low, high, spatial, temporal, pixels, n)
+    figures = signed_root(spatial / temporal), low, high, spatial, temporal, pixels, n
+    return Correctability(*figures, said)
 
 
 def validity_interval(times: ArrayLike, ratios: ArrayLike) -> float:

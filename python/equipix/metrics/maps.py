@@ -8,7 +8,7 @@ from equipix import _native
 from equipix._check import Array, ArrayLike, Bools, Floats, as_array, naming_memory, positive
 from equipix.errors import InputError
 from equipix.measured.colour import Colours, planes_of
-from equipix.measured.noise import BLOCK, scatter_limit
+from equipix.measured.noise import BLOCK, nanmedian, scatter_limit
 from equipix.metrics.frame_noise import stack_of, temporal_of
 
 
@@ -182,7 +182,8 @@ def netd(cold: ArrayLike, hot: ArrayLike, delta_k: float) -> Floats:
     Raises
     ------
     InputError
-        If the shapes do not fit, or `delta_k` is not above 0.
+        If the shapes do not fit, `delta_k` is not above 0, or the means of half of the pixels
+        differ between the levels by no more than their noise.
 
     Notes
     -----
@@ -210,6 +211,12 @@ def netd(cold: ArrayLike, hot: ArrayLike, delta_k: float) -> Floats:
     # Of the mean of two equal variances (Welch-Satterthwaite).
     freedom = round(4 / (1 / (len(low) - 1) + 1 / (len(high) - 1)))
     variance = (first.variance + second.variance) / 2 / scatter_limit(freedom + 1, sigmas=0)
+    error = np.sqrt(first.variance / len(low) + second.variance / len(high))
+    if nanmedian(rise - error, axis=(0, 1)) <= 0:
+        raise InputError(
+            f"'hot' differs from 'cold' by {nanmedian(rise, axis=(0, 1)):.3g} DN in the median, in "
+            "half of the pixels by no more than noise: give frames of two levels 'delta_k' apart"
+        )
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(delta_k * np.sqrt(variance) / rise)
 

@@ -2,15 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from equipix import _native
 from equipix._check import Array, Bools, By, Floats, Order, naming_memory, positive_workers
 from equipix.findings import ask, say, set_bits, usable
+from equipix.io.record import made, now
 from equipix.measured.means import Averaged
 from equipix.measured.noise import NoiseModel, median_of_noise
 from equipix.measured.statistics import FrameStatistics
@@ -145,7 +144,7 @@ def fitted(
 
     The other parameters and the errors are those of `fit`.
     """
-    started = datetime.now(UTC)
+    started = now()
     workers = positive_workers(workers)
     with naming_memory("fitting response curves"):
         options: dict[str, Any] = {"order": order, "by": by}
@@ -160,13 +159,9 @@ def fitted(
             if chosen == 0 and by == "gain":
                 check_gain(part)
         options["weights"] = "equal" if given.level_noise is None else "variances"
-        metadata = {
-            "versions": {"equipix": _native.__version__, "numpy": np.__version__},
-            "options": options,
-            "started": started.isoformat(timespec="seconds"),
-        }
         curves = [(pixels, _curves(part, chosen, by, workers)) for pixels, part in parts]
-        response = _response(given, _joined(curves), metadata | (provenance or {}))
+        metadata = made(options=options, started=started) | (provenance or {})
+        response = _response(given, _joined(curves), metadata)
         found = ask(INVERSE, response)
         # One point is right at one level, whatever the others are; "auto" judged them all.
         if chosen > 0 or order == "auto":
@@ -233,7 +228,6 @@ def _curves(levels: Levels, order: int, by: By, workers: int | None) -> dict[str
 
 def _response(levels: Levels, maps: dict[str, Array], metadata: dict[str, Any]) -> Response:
     """Make the result of the maps of `_curves`."""
-    finished = datetime.now(UTC).isoformat(timespec="seconds")
     flags = _flags(maps["deviation"], levels, maps.pop("rising"))
     error = maps["inverse_error"][usable(flags)]
     metadata["inverse"] = inverse_error(error, levels.frame_noise)
@@ -243,7 +237,7 @@ def _response(levels: Levels, maps: dict[str, Array], metadata: dict[str, Any]) 
         dark=levels.dark,
         raw=levels.raw,
         saturation=levels.saturation,
-        metadata=metadata | {"finished": finished},
+        metadata=metadata,
         findings=levels.findings,
         cfa=levels.colours,
         colour_response=levels.filters.response if levels.colours and levels.filters else None,

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from equipix._check import Array, Bools, Floats, ReadOnly, check_type, naming_memory
 from equipix.correction.protocol import named_cfa
 from equipix.errors import InputError
-from equipix.findings import Finding, ask, say, set_bits, usable
+from equipix.findings import Finding, Findings, ask, say, set_bits, usable
 from equipix.measured import defects, noise
 from equipix.measured.colour import Colours, Filters, planes_of
 from equipix.measured.defects import DefectLimits
@@ -37,11 +37,7 @@ def mean_slope(response: Response) -> Floats:
 
 
 def of_response(
-    response: Response,
-    slope: Floats,
-    limits: DefectLimits,
-    misfit: float,
-    filters: Filters | None,
+    response: Response, slope: Floats, limits: DefectLimits, misfit: float, filters: Filters | None
 ) -> dict[str, Bools]:
     """Bad pixels by their curves of this mean slope; `misfit` is that of the array.
 
@@ -76,14 +72,11 @@ def _range(response: Response) -> Floats:
 
 
 def of_frames(
-    frames: ArrayLike | FrameStatistics,
-    good: Bools,
-    limits: DefectLimits,
-    cfa: Colours | None,
-) -> tuple[dict[str, Bools], tuple[Finding, ...]]:
+    frames: ArrayLike | FrameStatistics, good: Bools, limits: DefectLimits, cfa: Colours | None
+) -> tuple[dict[str, Bools], Findings]:
     """Bad pixels by their noise, and what limits it; `good` are those whose curves are usable."""
     slow, light = None, Light()
-    said: tuple[Finding, ...] = ()
+    said: Findings = ()
     given = frames.mean if isinstance(frames, FrameStatistics) else stack_of("frames", frames)
     if given.shape[-2:] != good.shape:
         raise InputError(f"'frames' has frames of {given.shape[-2:]}, the sensor {good.shape}")
@@ -197,7 +190,7 @@ class Defects(ReadOnly):
     misfit: float = float("nan")
     limits: DefectLimits = field(default_factory=DefectLimits)
     not_determinable: dict[str, str] = field(default_factory=dict)
-    findings: tuple[Finding, ...] = ()
+    findings: Findings = ()
 
 
 def find_defects(
@@ -225,7 +218,8 @@ def find_defects(
     Returns
     -------
     Defects
-        ``response.with_flags(defects.flags, cfa=cfa)`` is a response that has them.
+        ``response.with_flags(defects.flags, cfa=cfa, findings=defects.findings)`` is a response
+        that has them.
 
     Raises
     ------
@@ -286,7 +280,7 @@ def find_defects(
         # Slopes of a response with filters are over the mean of a colour.
         filters = Filters.of(given, slope) if response.cfa is None else None
         colours = response.cfa if filters is None else filters.colours
-        said: tuple[Finding, ...] = ()
+        said: Findings = ()
         if filters is not None and filters.words:
             said = say(Finding("cfa", filters.words, "misfit"))
         found = of_response(response, slope, limits, misfit, filters)

@@ -20,7 +20,7 @@ from equipix.measured.noise import MEDIAN_SQUARE, NoiseModel
 from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.level_rules import GIVEN, Given
 
-_LEVELS = Words("'levels'", "level")
+_LEVELS = Words("'levels'", "level", pixel_variances=False)  # they would make weights noisy
 
 _FORMS = {1: "line", 2: "quadratic", 3: "cubic"}
 """Form that the core fits for each order above 0; that of order 0 is named by what is corrected."""
@@ -200,12 +200,7 @@ def levels_of(
 
 
 def _check_variance(variance: Array) -> None:
-    """Refuse variances that are not one number above 0 for each level."""
-    if variance.ndim != 1:
-        raise InputError(
-            f"'variance' has shape {variance.shape}, expected ({len(variance)},), one number a "
-            "level, or a NoiseModel: a pixel's own sample variance makes weights noisy"
-        )
+    """Refuse variances that are not above 0."""
     wrong = variance[~(np.isfinite(variance) & (variance > 0))]
     if wrong.size:
         raise InputError(f"'variance' holds {wrong[0]:g}, expected finite numbers above 0, in DN²")

@@ -6,11 +6,11 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from equipix._check import Array, Bools, Flagged, Floats, as_array, naming_memory
-from equipix.correction.apply import CorrectionBase, apply, checked_frames
+from equipix._check import Array, Bools, Floats, as_array, naming_memory
+from equipix.correction.apply import CorrectionBase, Formula, checked_frames
 from equipix.correction.protocol import Dark, named_cfa, with_dark
 from equipix.errors import InputError
-from equipix.findings import Finding, usable
+from equipix.findings import Findings, usable
 from equipix.io.record import Counts, Doubles, Map, Record
 from equipix.measured.colour import Colours
 from equipix.measured.noise import median_of_noise
@@ -90,7 +90,7 @@ class Response(CorrectionBase, Record, kind="response", version=2):
     metadata: dict[str, Any] = field(default_factory=dict)
     cfa: Colours | None = None
     colour_response: dict[str, float] | None = None
-    findings: tuple[Finding, ...] = ()
+    findings: Findings = ()
     takes_dark: ClassVar[bool] = True
     needs_dark: ClassVar[bool] = False
 
@@ -156,67 +156,19 @@ class Response(CorrectionBase, Record, kind="response", version=2):
             f"<Response of {rows} x {cols} pixels, order {self.order}, {len(self.levels)} levels>"
         )
 
-    def correct(
-        self,
-        frames: ArrayLike,
-        *,
-        dark: Dark = "stored",
-        flagged: Flagged = "nan",
-        exact: bool = False,
-        out: Array | None = None,
-    ) -> Array:
-        """Frames as a sensor of equal pixels would have given them.
-
-        Parameters
-        ----------
-        frames : array_like, shape (rows, cols) or (n, rows, cols)
-            Frames in DN: raw ones if a dark is stored or the levels were raw.
-        dark : "stored", FrameStatistics, array_like of shape (rows, cols), or None
-            The dark frame to subtract, in DN: the stored one if there is one, another, or none
-            where it is already subtracted. A response to raw levels takes none.
-        flagged : {"nan", "keep", "replace"}
-            The value of pixels flagged ``DO_NOT_USE``: NaN, the value that the formula gives (NaN
-            still where the curve is undetermined), or the mean of the nearest good pixels around.
-        exact : bool
-            Whether to invert orders 2 and 3 exactly, some 20 times slower, with the slope at the
-            end of the valid range beyond it. The cubic differs by at most `inverse_error`.
-        out : ndarray, optional
-            Array for the result, of the frames' shape, float32 or float64; of frames of 8 or 16
-            bits and float32, unless `exact`, also uint8 or uint16, which hold no NaN: rounded half
-            to even, and limited to the range of the type (`equipix.Corrector` counts such values).
-
-        Returns
-        -------
-        ndarray, of the frames' shape
-            Of dtype float64 for float64 frames, else float32; or `out`. Values outside the valid
-            range are extrapolated: see `extrapolated`.
-
-        Raises
-        ------
-        InputError
-            If a shape does not fit, `flagged` is unknown, frames are of another bit depth, or a
-            dark is given to a response without one.
-        """
+    def _formula(self, dark: Dark, exact: bool, /) -> Formula | None:
+        """Exact inverse of the curves."""
         if not exact:
-            return super().correct(frames, dark=dark, flagged=flagged, out=out)
+            return None
         offset = with_dark(self, dark).dark
         zero = np.zeros(self.shape) if offset is None else offset
 
         # Curves that have an inverse.
         rising = np.where(np.isnan(self.inverse[0]), np.nan, self.deviation)
-
-        def formula(frame: Array) -> Array:
-            return exact_inverse(rising, frame - zero, self.limits)
-
-        return apply(self, frames, dark, flagged, out, formula)
+        return lambda frame: exact_inverse(rising, frame - zero, self.limits)
 
     @naming_memory("finding extrapolated values")
-    def extrapolated(
-        self,
-        frames: ArrayLike,
-        *,
-        dark: Dark = "stored",
-    ) -> Bools:
+    def extrapolated(self, frames: ArrayLike, *, dark: Dark = "stored") -> Bools:
         """Which values lie outside the range that the levels cover, so their correction is a guess.
 
         Parameters
@@ -242,8 +194,10 @@ class Response(CorrectionBase, Record, kind="response", version=2):
         low, high = self.valid_range if offset is None else self.valid_range + offset
         return np.asarray(~((raw >= low) & (raw <= high)))
 
-    def with_flags(self, flags: Array, *, cfa: ArrayLike | None = None) -> Self:
-        """Return a copy with more flags, such as those of `find_defects`.
+    def with_flags(
+        self, flags: Array, *, cfa: ArrayLike | None = None, findings: Findings = ()
+    ) -> Self:
+        """Return a copy with more flags and findings, such as those of `find_defects`.
 
         Parameters
         ----------
@@ -252,12 +206,14 @@ class Response(CorrectionBase, Record, kind="response", version=2):
         cfa : str or array_like of labels, optional
             Colour filters of the pixels, as for `find_defects`, where the response was fitted
             without: flagged pixels are then replaced within a colour. Curves do not change.
+        findings : tuple of Finding
+            What limits the flags; those that the response has already are not repeated.
 
         Returns
         -------
         Response
-            The copy; these flags survive saving, and so do filters, as ``cfa`` of the sensor in
-            `metadata`.
+            The copy; flags and findings survive saving, and so do filters, as ``cfa`` of the
+            sensor in `metadata`.
 
         Raises
         ------
@@ -279,7 +235,9 @@ class Response(CorrectionBase, Record, kind="response", version=2):
         colours, metadata = named_cfa(self, cfa), self.metadata
         if colours not in (None, self.cfa):
             metadata = {**metadata, "sensor": {**metadata.get("sensor", {}), "cfa": colours.rows}}
-        return replace(self, flags=self.flags | more.astype(np.uint32), metadata=metadata)
+        said = tuple(dict.fromkeys(self.findings + findings))
+        combined = self.flags | more.astype(np.uint32)
+        return replace(self, flags=combined, metadata=metadata, findings=said)
 
 
 def common_misfit(response: Response) -> float:

@@ -18,6 +18,10 @@ from equipix.plan.pattern_errors import Spectrum
 _WHOLE = 0.02
 """Largest fraction of a pixel at which shifts count as whole, as in `calibrate`'s warning."""
 
+_NOISY = 0.1
+"""Error by noise, and light over that of other pixels, from which pixels are looked at one by one:
+beside one pixel in a hundred that is not determined the rms is larger."""
+
 _UNDETERMINED = 1e-4
 """λ of a wave that shifts between pixels do not determine, as in a calibration's finding."""
 
@@ -136,8 +140,8 @@ def error_budget(
     MisfitWarning
         If the tilt that drift leaves exceeds the error from noise.
     IdentifiabilityWarning
-        If the shifts leave parts of the sensor uncompared, or, between pixels, do not constrain a
-        wave.
+        If the shifts leave parts of the sensor uncompared, lie on one line, or, between pixels, do
+        not constrain a wave; if the beam lights only a part of the sensor.
 
     Notes
     -----
@@ -172,22 +176,16 @@ def error_budget(
     variances = partial(
         pattern_errors.local_variance, sizes, positions, powers, beam_width, scale=scale
     )
-    drift_tilt = tilt_of_fluxes(sizes, exact, drift)
-    along_rows, along_cols = drift_tilt.tolist()
-    moved, moved_tilt = pattern_errors.shift_error_effect(
-        sizes, exact, powers, beam_width, shift_error
-    )
-    causes = {
-        "noise": _rms(variances()),
-        "drift": float(tilt_rms(drift_tilt)),
-        "shift_error": moved,
-    }
+    drifted = tilt_of_fluxes(sizes, exact, drift)
+    along_rows, along_cols = drifted.tolist()
+    moved, tilt = pattern_errors.shift_error_effect(sizes, exact, powers, beam_width, shift_error)
+    causes = {"noise": _rms(variances()), "drift": float(tilt_rms(drifted)), "shift_error": moved}
     budget = ErrorBudget(
         shape=sizes,
         shifts=exact,
         rms=float(np.linalg.norm(list(causes.values()))),
         rms_by_cause=causes,
-        tilt_by_cause={"drift": (along_rows, along_cols), "shift_error": moved_tilt},
+        tilt_by_cause={"drift": (along_rows, along_cols), "shift_error": tilt},
         spectrum=waves,
         distinct_trend=distinct_trend(exact),
         components=components,
@@ -256,10 +254,33 @@ def _on_components(budget: ErrorBudget) -> str | None:
     )
 
 
+def _on_line(budget: ErrorBudget) -> str | None:
+    """Say that shifts along one line leave a tilt undetermined, whatever the lamp's drift."""
+    if np.isfinite(budget.rms_by_cause["drift"]):
+        return None
+    return (
+        "the shifts lie on one line, so that any drift of the lamp leaves the tilt of the "
+        "sensitivity across it undetermined: choose shifts along both axes (equipix.plan.suggest)"
+    )
+
+
+def _on_beam(budget: ErrorBudget) -> str | None:
+    """Say that the beam lights only a part of the sensor."""
+    noise = budget.noise_map if budget.rms_by_cause["noise"] > _NOISY else np.zeros(1)
+    share = np.mean((noise > max(1, noise.min() / _NOISY)) & np.isfinite(noise))
+    width = np.ceil(np.hypot(*budget.shape) / 2 / np.log(1 / _NOISY) ** 0.5)
+    words = (
+        f"the beam is too weak for {share:.1%} of the pixels, whose sensitivity is not determined, "
+        f"since its error by noise exceeds it: take 'beam_width' {width:.0f} or more, which gives "
+        "the corners a tenth of the light"
+    )
+    return words if share else None
+
+
 def _on_drift(budget: ErrorBudget) -> str | None:
     """Say that the tilt from drift exceeds the noise."""
     drift, noise = (budget.rms_by_cause[cause] for cause in ("drift", "noise"))
-    if not drift > noise > 0:
+    if not np.inf > drift > noise > 0:
         return None
     return (
         f"lamp drift will tilt the sensitivity by {drift:.1e} rms, {drift / noise:.1f} times the "
@@ -271,6 +292,8 @@ def _on_drift(budget: ErrorBudget) -> str | None:
 _RULES: tuple[Rule[ErrorBudget], ...] = (
     Rule("pattern", "identifiability", _on_wave),
     Rule("components", "identifiability", _on_components),
+    Rule("tilt", "identifiability", _on_line, unless=frozenset({"components"})),
+    Rule("beam", "identifiability", _on_beam),
     Rule("drift", "misfit", _on_drift),
 )
 """What is asked of a pattern of shifts."""

@@ -1,6 +1,6 @@
 """Main figures of results, with their names and units."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
@@ -10,7 +10,8 @@ from equipix._check import Array
 from equipix.bolometer.dynamic import DynamicCorrection
 from equipix.calibration.result import Calibration
 from equipix.correction.protocol import Correction, sensor_of
-from equipix.findings import Finding, Flag, usable
+from equipix.diagnosis.coverage import FAR
+from equipix.findings import Findings, Flag, usable
 from equipix.io.record import Record
 from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.response import Response, common_misfit
@@ -32,11 +33,9 @@ def known(**figures: Any) -> dict[str, Any]:
     return {name: value for name, value in figures.items() if value not in (None, "")}
 
 
-def told(findings: Iterable[Finding], *, as_json: bool = True) -> dict[str, Any]:
+def told(findings: Findings, *, as_json: bool = True) -> dict[str, Any]:
     """Findings; their kinds alone where messages are on stderr, as warnings, already."""
-    if as_json:
-        return {"findings": [asdict(each) for each in findings]}
-    return {"findings": ", ".join(each.kind for each in findings) or "none"}
+    return {"findings": [asdict(each) if as_json else each.kind for each in findings]}
 
 
 def _of_correction(correction: Correction) -> dict[str, Any]:
@@ -77,12 +76,11 @@ def of_response(response: Response) -> dict[str, Any]:
     }
 
 
-def _colours(correction: Calibration | Response) -> dict[str, str]:
+def _colours(correction: Calibration | Response) -> dict[str, Any]:
     """Colour filters and the responses of the colours, of mean 1, where there are any."""
     if correction.cfa is None or correction.colour_response is None:
         return {}
-    found = [f"{label} {value:.4g}" for label, value in correction.colour_response.items()]
-    return {"cfa": str(correction.cfa), "colour_response": ", ".join(found)}
+    return {"cfa": str(correction.cfa), "colour_response": correction.colour_response}
 
 
 def _level_values(response: Response) -> dict[str, list[str]]:
@@ -96,12 +94,10 @@ def _level_values(response: Response) -> dict[str, list[str]]:
     return {"level_values": [" ".join(each.split()) for each in texts]} if named else {}
 
 
-def _misfit(response: Response, options: dict[str, Any]) -> float | str:
+def _misfit(response: Response, options: dict[str, Any]) -> float:
     """Median reduced χ² over that of noise; without variances the mean, a variance in DN²."""
     judged = usable(response.flags) & (response.freedom > 0)
-    if not judged.any():
-        return "not determined"
-    if options.get("weights") == "equal":
+    if options.get("weights") == "equal" and judged.any():
         return float(np.mean(response.reduced_chi2[judged]))
     return common_misfit(response)
 
@@ -129,7 +125,7 @@ def of_scene(method: SceneCorrection) -> dict[str, Any]:
         "usable_frames": method.frames_taken,
         "frames_that_counted": method.frames,
         "frames_foreign": method.frames_foreign,
-        "floor_dn": method.floor,
+        "floor_dn": np.nan if (floor := method.floor) is None else floor,
         "gain_rms": float(np.std(method.gain)),
         "offset_rms": float(np.std(method.offset)),
     }
@@ -142,11 +138,12 @@ def of_statistics(frames: FrameStatistics) -> dict[str, Any]:
         "shape": list(frames.mean.shape),
         "frames": int(frames.count.max()),
         "mean": float(np.nanmean(frames.mean)),
-        "variance": float(np.nanmean(frames.variance)) if several else float("nan"),
+        "variance": float(np.nanmean(frames.variance)) if several else np.nan,
         "saturation": frames.saturation,
         "saturated_pixels": int(np.count_nonzero(frames.saturated)),
         **known(rejected_beyond_sigmas=frames.reject),
         "dark_frames": 0 if frames.dark is None else int(frames.dark.count.max()),
+        **told(frames.findings),
     }
 
 
@@ -161,7 +158,7 @@ def flagged(correction: Correction | DynamicCorrection) -> dict[str, int]:
 
 def of_calibration(calibration: Calibration) -> dict[str, Any]:
     """Collect the main figures of a calibration."""
-    sensitivity = calibration.sensitivity
+    sensitivity, components = calibration.sensitivity, calibration.components
     options = calibration.metadata.get("options", {})
     return {
         **known(sensor=sensor_of(calibration)),
@@ -174,7 +171,7 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
         "error_estimate": calibration.error_estimate,
         "sweeps": calibration.sweeps,
         _misfit_name(options): calibration.reduced_chi2,
-        "components": calibration.components,
+        "components": components if components > 1 or calibration.error_estimate <= FAR else np.nan,
         "shift_sign": calibration.shift_sign,
         **known(orientation=calibration.orientation and calibration.orientation.words),
         "fluxes": options.get("flux", "known"),

@@ -21,7 +21,7 @@ from equipix._native import SceneCorrection as Native
 from equipix.correction.polynomial import Polynomial
 from equipix.errors import InputError
 from equipix.findings import Rule, ask, say, set_bits
-from equipix.io.record import Record
+from equipix.io.record import Record, made
 from equipix.measured.defects import unresponsive
 from equipix.shown import Shown
 
@@ -30,6 +30,9 @@ DataRange = tuple[float, float]
 
 _FEW = 0.1
 """Share of the frames that counted below which it is a finding."""
+
+_FLOOR = 32
+"""Frames that count before the compiled part measures the floor."""
 
 _STILL = 0.25
 """Share of the field that never moved above which it is a finding."""
@@ -215,14 +218,15 @@ class SceneCorrection(Shown):
         Raises
         ------
         InputError
-            If the frame has another shape, or a finite value more than one span outside of the
-            range; then nothing has changed.
+            If the frame has another shape, a finite value more than one span outside of the range,
+            or whole numbers of a type that does not reach half of it; then nothing has changed.
         """
         raw = as_array("frame", frame, ndim=2)
         if raw.shape != self.shape or raw.dtype == np.bool_:
             raise InputError(
                 f"'frame' is {raw.dtype} of shape {raw.shape}, expected numbers of {self.shape}"
             )
+        check_range(self._range, raw.dtype, "'frame'")
         taken = raw if raw.dtype in _TAKEN else raw.astype(np.float64)
         corrected = np.empty(self.shape, np.float32)
         level = self.saturation
@@ -281,8 +285,8 @@ class SceneCorrection(Shown):
         Warns
         -----
         InputWarning
-            If less than a tenth of the usable frames counted, a quarter of the field never moved,
-            the frames use less than a third of the range, or the gains spread too far.
+            If fewer than 32 frames or a tenth of the usable ones counted, a quarter of the field
+            never moved, the frames use less than a third of the range, or the gains spread too far.
         """
         self.check_learned()
         gain, offset = (each.astype(np.float64) for each in self._native.coefficients())
@@ -290,24 +294,22 @@ class SceneCorrection(Shown):
         flags = np.zeros(self.shape, np.uint32)
         set_bits(flags, "out_of_range", self._mask)
         set_bits(flags, "dead", unresponsive(gain, self._native.deviation(), self.frames_taken))
-        metadata = {
-            "scene": {
-                "method": self.method,
-                "options": self.options,
-                "data_range": list(self._range),
-                "saturation": self.saturation,
-                "frames": self.frames,
-                "frames_taken": self.frames_taken,
-                "frames_foreign": self.frames_foreign,
-                "floor_dn": self.floor,
-            }
+        scene = {
+            "method": self.method,
+            "options": self.options,
+            "data_range": list(self._range),
+            "saturation": self.saturation,
+            "frames": self.frames,
+            "frames_taken": self.frames_taken,
+            "frames_foreign": self.frames_foreign,
+            "floor_dn": self.floor,
         }
         learned = _Learned(self, self._native.still(), self._seen.peak, gain[flags == 0])
         said = say(*ask(_RULES, learned))
         coefficients = np.stack([low * (1 - gain) + (high - low) * offset, gain])
         # The mean of the offsets is 0, so that of raw frames stays.
         # No saturation: bits would follow from it, and frames that `update` takes be refused.
-        return Polynomial(coefficients, flags, metadata, leaves_offset=True, findings=said)
+        return Polynomial(coefficients, flags, made(scene=scene), leaves_offset=True, findings=said)
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Write the state to a file, from which `equipix.load` goes on with the same bytes.
@@ -333,6 +335,23 @@ class SceneCorrection(Shown):
         """Go on from the maps and counts of a state; the errors are those of `resumed`."""
         self._native.restore([*state.maps.items()], [*state.counts.items()])
         self._seen.masked_at, self._seen.peak = self.frames_taken, state.peak
+
+
+def check_range(data_range: DataRange, dtype: np.dtype[Any], place: str) -> None:
+    """Refuse frames of whole numbers whose type does not reach half of the range.
+
+    Raises
+    ------
+    InputError
+        With the place, the type and the range.
+    """
+    low, high = data_range
+    if dtype.kind in "iu" and np.iinfo(dtype).max < (low + high) / 2:
+        raise InputError(
+            f"{place}: the range of raw values is {low:g} to {high:g} DN, but the frames are "
+            f"{dtype}, up to {np.iinfo(dtype).max}: give frames of the same bits, or their range "
+            "as 'data_range' (--data-range)"
+        )
 
 
 def _mask_of(mask: ArrayLike | None, shape: tuple[int, int]) -> Array:
@@ -362,6 +381,16 @@ def _on_few(e: _Learned) -> str | None:
     return (
         f"{frames} of {taken} frames counted: the scene moved hardly, or "
         "its contrast is too low for its motion to be seen beside the pattern"
+    )
+
+
+def _on_floor(e: _Learned) -> str | None:
+    """Say that a pattern was learned of so few frames that what it leaves is not known."""
+    if e.method.frames >= _FLOOR:
+        return None
+    return (
+        f"only {e.method.frames} of the frames counted (limit {_FLOOR}, from which 'floor' is "
+        "measured): which part of the pattern is their scene is not known; take more frames"
     )
 
 
@@ -403,6 +432,7 @@ def _on_spread(e: _Learned) -> str | None:
 
 _RULES: tuple[Rule[_Learned], ...] = (
     Rule("unused", "input", _on_few),
+    Rule("few", "input", _on_floor, unless=frozenset({"unused"})),
     Rule("still", "input", _on_still),
     Rule("range", "input", _on_range),
     Rule("spread", "input", _on_spread),

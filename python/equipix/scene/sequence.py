@@ -3,13 +3,13 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from equipix._check import Array, Progress, check_progress
 from equipix.correction.correct_files import warn_of_corrected
 from equipix.errors import FileError, InputError
+from equipix.findings import Findings
 from equipix.io.formats import raw_headers
 from equipix.io.frames import stream_frames
 from equipix.io.paths import find_files, refuse_inputs, write_whole
@@ -38,6 +38,8 @@ class SequenceResult:
         Roughness of these frames before and after correction, see `metrics.roughness`.
     last : ndarray, shape (rows, cols)
         The last frame with finite values, raw.
+    findings : tuple of Finding
+        What limits the frames, each also a warning.
     """
 
     frames: int
@@ -45,22 +47,7 @@ class SequenceResult:
     raw: tuple[float, ...]
     corrected: tuple[float, ...]
     last: Array
-
-
-def check_range(data_range: tuple[float, float], dtype: np.dtype[Any], state: Path) -> None:
-    """Refuse frames of whole numbers whose type does not reach half of the range of a state.
-
-    Raises
-    ------
-    InputError
-        With the file of the state, the type and the range.
-    """
-    low, high = data_range
-    if dtype.kind in "iu" and np.iinfo(dtype).max < (low + high) / 2:
-        raise InputError(
-            f"{state}: was learned from values of {low:g} to {high:g} DN, but the frames are "
-            f"{dtype}, up to {np.iinfo(dtype).max}: give frames of the same bits"
-        )
+    findings: Findings
 
 
 def run_sequence(
@@ -101,7 +88,7 @@ def run_sequence(
     check_progress(progress)
     files = find_files(source)
     headers = raw_headers(files, method.shape)
-    warn_of_corrected(headers, "")
+    said = warn_of_corrected(headers, "")
     record = _Record(sum(header.shape[0] for header in headers.values()))
     frames = _corrected(method, files, record, progress)
     if output is None:
@@ -114,7 +101,7 @@ def run_sequence(
             nbytes = 4 * record.total * rows * cols
             write_frames(temporary, frames, nbytes=nbytes, description=_MARK)
             method.check_learned()
-    return record.sequence()
+    return record.sequence(said)
 
 
 class _Record:
@@ -135,15 +122,15 @@ class _Record:
         if finite and (self.done % self._every == 0 or self.done == 1):
             self._points.append((self.done, roughness(raw), roughness(corrected)))
 
-    def sequence(self) -> SequenceResult:
-        """What was recorded."""
+    def sequence(self, said: Findings) -> SequenceResult:
+        """What was recorded, and what limits the frames."""
         if self._last is None:
             raise FileError("no frame holds finite values that differ: nothing to learn from")
         number, last, after = self._last
         if not self._points or self._points[-1][0] != number:
             self._points.append((number, roughness(last), roughness(after)))
         points, raw, corrected = zip(*self._points, strict=True)
-        return SequenceResult(self.done, points, raw, corrected, last.copy())
+        return SequenceResult(self.done, points, raw, corrected, last.copy(), said)
 
 
 def _corrected(

@@ -9,7 +9,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from equipix._check import ArrayLike, Floats, Rng, as_array, as_shifts, per_exposure
+from equipix._check import ArrayLike, Floats, Rng, as_array, as_shifts, check_shape, per_exposure
 from equipix.errors import InputError
 from equipix.measured.colour import Colours
 
@@ -17,6 +17,13 @@ Beam: TypeAlias = "Callable[[Floats, Floats], Floats]"
 
 COLOUR_RESPONSE = {"R": 0.35, "G": 1.0, "B": 0.45}
 """Responses of the colours of a camera to a halogen lamp, over that of green."""
+
+
+def check_beam(beam: object) -> None:
+    """Refuse what is no function, such as the values of a beam on a sensor."""
+    if not callable(beam):
+        given = f"'beam' is of type {type(beam).__name__}, expected a function"
+        raise InputError(f"{given} of arrays of row and column coordinates: see gaussian_beam")
 
 
 def paper_sensitivity(shape: tuple[int, int], *, spread: float = 0.05, rng: Rng) -> Floats:
@@ -42,7 +49,7 @@ def paper_sensitivity(shape: tuple[int, int], *, spread: float = 0.05, rng: Rng)
     >>> bool(abs(simulate.paper_sensitivity((4, 6), rng=1) - 1).max() <= 0.05)
     True
     """
-    return 1 + np.random.default_rng(rng).uniform(-spread, spread, shape)
+    return 1 + np.random.default_rng(rng).uniform(-spread, spread, check_shape(shape))
 
 
 def cosine_sensitivity(
@@ -115,7 +122,7 @@ def filtered(
     if missing:
         raise InputError(
             f"'cfa' has the colours {missing}, whose response is not known (known: "
-            f"{', '.join(known)}): give 'response'"
+            f"{', '.join(known)}): use these alone, or in Python give the response of each"
         )
     return np.asarray(plain * colours.map_of(known, plain.shape), np.float64)
 
@@ -152,6 +159,7 @@ def gaussian_beam(
     >>> float(beam(119.5, 159.5))
     1.0
     """
+    shape = check_shape(shape)
     row, col = centre if centre is not None else ((shape[0] - 1) / 2, (shape[1] - 1) / 2)
 
     def beam(rows: Floats, cols: Floats) -> Floats:
@@ -327,6 +335,7 @@ def exposures(
 
 def window(beam: Beam, shape: tuple[int, ...], shift: Floats, rotation: float = 0.0) -> Floats:
     """Evaluate the part of the beam on a sensor of that shape, L(u_k(p))."""
+    check_beam(beam)
     turns, rest = divmod(rotation, 90)
     if rest:
         raise InputError(f"'rotation' holds {rotation}°, expected multiples of 90°")

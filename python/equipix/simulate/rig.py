@@ -15,7 +15,7 @@ from equipix.io.tiff import write_frames
 from equipix.measured.colour import Colours
 from equipix.measured.noise import UNIFORM, scatter, unaveraged
 from equipix.simulate.accuracy import noise_prediction
-from equipix.simulate.beams import Beam, filtered, window
+from equipix.simulate.beams import Beam, check_beam, filtered, window
 from equipix.simulate.camera import Camera, Pixels
 
 FULL_SCALE_E = 20_000.0
@@ -333,6 +333,7 @@ def experiment(
     >>> next(virtual.frames(1)).shape
     (48, 64)
     """
+    check_beam(beam)
     rng = np.random.default_rng(rng)
     size = as_array("sensitivity", sensitivity, ndim=2).size
     dark_frames = frames if dark_frames is None else dark_frames
