@@ -10,7 +10,7 @@ import numpy as np
 
 from equipix._check import Array
 from equipix.errors import FileError
-from equipix.experiment.manifest import LevelManifest, Manifest, entry_files
+from equipix.experiment.manifest import AnyManifest, CameraManifest, LevelManifest, entry_files
 from equipix.io.arrays import split
 from equipix.io.formats import refuse_saved
 from equipix.io.frames import frame_format, read_frames
@@ -61,26 +61,28 @@ class Entry(NamedTuple):
 
 
 def refuse_repeats(
-    path: Path, manifest: Manifest | LevelManifest, hashes: Mapping[Path, str] | None = None
+    path: Path, manifest: AnyManifest, hashes: Mapping[Path, str] | None = None
 ) -> None:
     """Refuse a file that stands for two measurements, by its name or, with `hashes`, its content.
 
     One image of the aperture may serve for two moves: it is after the one and before the other.
-    Dark frames may be equal, as those of a camera that shows 0 in the dark.
+    Dark frames may be equal, as those of a camera that shows 0 in the dark. Those of a camera.toml
+    may serve for several exposures.
 
     Raises
     ------
     FileError
         With the file and where it stands.
     """
-    entries = [*_entries(path, manifest)]
+    entries = [*entries_of(path, manifest)]
     for entry in entries:
         if hashes is None or entry.key != "dark":
             for one, other in _alike(entry.files, entry.files, hashes):
                 raise FileError(f"{path}: {_words(one, other)} twice in {entry}")
     for first, second in combinations(entries, 2):
         images = "aperture" in first.key and "aperture" in second.key
-        if images and first.exposure != second.exposure:
+        darks = first.key == second.key == "dark"
+        if darks or (images and first.exposure != second.exposure):
             continue
         for one, other in _alike(first.files, second.files, hashes):
             raise FileError(
@@ -105,13 +107,19 @@ def refuse_repeated_files(frames: list[Path], dark: list[Path]) -> None:
             )
 
 
-def image_files(path: Path, manifest: Manifest | LevelManifest) -> list[Path]:
+def image_files(path: Path, manifest: AnyManifest) -> list[Path]:
     """List the files of all measurements, each once."""
-    return list(dict.fromkeys(file for entry in _entries(path, manifest) for file in entry.files))
+    return list(dict.fromkeys(file for entry in entries_of(path, manifest) for file in entry.files))
 
 
-def _entries(path: Path, manifest: Manifest | LevelManifest) -> Iterator[Entry]:
+def entries_of(path: Path, manifest: AnyManifest) -> Iterator[Entry]:
     """Give the keys that name files of measurements, with the files."""
+    if isinstance(manifest, CameraManifest):
+        for name, each in manifest.series:
+            kind = "table" if each is manifest.spatial else "exposure"
+            yield Entry("frames", name, entry_files(path, each.frames), kind)
+            yield Entry("dark", name, entry_files(path, each.dark), kind)
+        return
     if manifest.dark is not None:
         yield Entry("dark", "", entry_files(path, manifest.dark.frames))
     if isinstance(manifest, LevelManifest):
