@@ -25,7 +25,7 @@ def emva(
     force: terminal.Force = False,
     as_json: terminal.Json = False,
 ) -> None:
-    """Figures of a camera after EMVA 1288, release 4.0 linear, and a page of them."""
+    """Figures of a camera after EMVA 1288, and a page of them."""
     terminal.check_output(output, force=force, suffixes=(".html",))
     loaded = CameraExperiment.load(camera)
     refuse_inputs(terminal.given(output), [loaded.path, *loaded.files()])

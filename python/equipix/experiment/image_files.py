@@ -75,16 +75,17 @@ def refuse_repeats(
         With the file and where it stands.
     """
     entries = [*entries_of(path, manifest)]
+    marks = hashes or _resolved(file for entry in entries for file in entry.files)
     for entry in entries:
         if hashes is None or entry.key != "dark":
-            for one, other in _alike(entry.files, entry.files, hashes):
+            for one, other in _alike(entry.files, entry.files, marks):
                 raise FileError(f"{path}: {_words(one, other)} twice in {entry}")
     for first, second in combinations(entries, 2):
         images = "aperture" in first.key and "aperture" in second.key
         darks = first.key == second.key == "dark"
         if darks or (images and first.exposure != second.exposure):
             continue
-        for one, other in _alike(first.files, second.files, hashes):
+        for one, other in _alike(first.files, second.files, marks):
             raise FileError(
                 f"{path}: {_words(one, other)} in {first} and in {second}: give each its own frames"
             )
@@ -98,10 +99,11 @@ def refuse_repeated_files(frames: list[Path], dark: list[Path]) -> None:
     FileError
         With the file and where it stands.
     """
-    for hashes in (None, sha256_of(dict.fromkeys([*frames, *dark]))):
-        for one, other in _alike(frames, frames, hashes):
+    files = dict.fromkeys([*frames, *dark])
+    for marks in (_resolved(files), sha256_of(files)):
+        for one, other in _alike(frames, frames, marks):
             raise FileError(f"{_words(one, other)} twice in the frames: give each once")
-        for one, other in _alike(frames, dark, hashes):
+        for one, other in _alike(frames, dark, marks):
             raise FileError(
                 f"{_words(one, other)} in the frames and in 'dark': give each its own frames"
             )
@@ -133,11 +135,15 @@ def entries_of(path: Path, manifest: AnyManifest) -> Iterator[Entry]:
                 yield Entry(key, exposure.name, entry_files(path, entry))
 
 
+def _resolved(files: Iterable[Path]) -> dict[Path, Path]:
+    """Places of files, whatever their names."""
+    return {file: file.resolve() for file in files}
+
+
 def _alike(
-    first: list[Path], second: list[Path], hashes: Mapping[Path, str] | None
+    first: list[Path], second: list[Path], marks: Mapping[Path, object]
 ) -> Iterator[tuple[Path, Path]]:
-    """Give the pairs of the same file, or of the same content; within a list if both are one."""
-    marks = {file: file.resolve() if hashes is None else hashes[file] for file in [*first, *second]}
+    """Give the pairs of files with the same mark; within a list if both are one."""
     seen = {} if second is first else {marks[file]: file for file in reversed(first)}
     for file in second:
         if marks[file] in seen:
