@@ -253,9 +253,11 @@ class TestCamera:
         assert checked.open == []
         assert all(each.startswith("data:image/png;base64,") for each in checked.addresses)
         figures = re.findall(r'<th scope="row">([^<]*)</th><td>([^<]*)</td></tr>', text)
-        shown = dict(re.findall(r"^ +(\S.*?)  +(\S.*?) *$", printed, re.MULTILINE))
-        assert len(shown) > 20
-        assert shown.items() <= dict(figures).items()
+        _, *listed = re.findall(r"^ +(\S.*?)  +(?:(\S+) +)?(\S.*?) *$", printed, re.MULTILINE)
+        assert len(listed) > 25
+        words = dict(figures)
+        for name, unit, number in listed:
+            assert f"{number} {unit}".strip() in words[name].split(", ")
         for title in (
             *("Responsivity", "Photon transfer", "Deviation from linearity", "Mean of the dark"),
             *("Signal-to-noise ratio", "Spectrum of dark signal", "Profiles of photo response"),
@@ -275,7 +277,7 @@ class TestCamera:
         text = out.read_text(encoding="utf-8")
         for plane in ("R", "G1", "G2", "B"):
             assert f", plane {plane}</h2>" in text
-        assert re.search(r"figure +R +G1 +G2 +B", printed)
+        assert re.search(r"figure +unit +R +G1 +G2 +B", printed)
         found = json.loads(run("emva", path, "--json")[1])
         assert [*found] == ["output", "R", "G1", "G2", "B"]
         assert found["R"]["gain_dn_per_e"] == pytest.approx(0.25, rel=0.2)

@@ -8,7 +8,7 @@ import typer
 from equipix.cli import terminal
 from equipix.experiment.camera import CameraExperiment
 from equipix.io.paths import refuse_inputs, write_whole
-from equipix.report.camera import camera_parts, figures_of, words_of
+from equipix.report.camera import camera_parts, figures_of
 from equipix.report.figures import told
 from equipix.report.page import page
 
@@ -44,6 +44,8 @@ def emva(
             {"output": str(output or "none")} | result.get("", result), as_json=True
         )
         return
-    words = [words_of(found) for found in planes.values()]
-    rows = ((name, *(each[name] for each in words)) for name in words[0])
-    terminal.show_table(("figure", *planes), rows)
+    rows = zip(*map(figures_of, planes.values()), strict=True)
+    terminal.show_table(
+        ("figure", "unit", *planes),
+        ((each[0].name, each[0].unit, *(figure.number for figure in each)) for each in rows),
+    )

@@ -34,11 +34,11 @@ class Figure(NamedTuple):
     value: float
 
     @property
-    def words(self) -> str:
-        """Value and unit."""
+    def number(self) -> str:
+        """The value in digits."""
         if not np.isfinite(self.value):
             return "not known"
-        return f"{self.value:{'.0f' if abs(self.value) >= _WHOLE else '.4g'}} {self.unit}".strip()
+        return f"{self.value:{'.0f' if abs(self.value) >= _WHOLE else '.4g'}}"
 
 
 def figures_of(found: CameraFigures) -> Iterator[Figure]:
@@ -51,8 +51,8 @@ def figures_of(found: CameraFigures) -> Iterator[Figure]:
     yield Figure("quantum_efficiency_percent", "quantum efficiency η", "%", efficiency)
     yield Figure("dark_noise_dn", "temporal dark noise with quantisation", "DN", t.dark_noise_dn)
     yield Figure("dark_noise_e", "temporal dark noise σ_d", "e⁻", t.read_noise_e)
-    yield from _with_logarithms("snr_max", "largest signal-to-noise ratio", t.snr_max)
-    yield Figure("inverse_snr_max_percent", "inverse of this ratio", "%", 100 / t.snr_max)
+    yield from _with_logarithms("snr_max", "largest SNR", t.snr_max)
+    yield Figure("inverse_snr_max_percent", "inverse of the largest SNR", "%", 100 / t.snr_max)
     for key, name, photons, electrons in (
         ("threshold", "absolute sensitivity threshold", t.threshold_light, t.threshold_e),
         ("saturation", "saturation capacity", t.saturation_light, t.saturation_e),
@@ -84,13 +84,12 @@ def _with_logarithms(key: str, name: str, ratio: float) -> Iterator[Figure]:
     yield Figure(f"{key}_bits", name, "bit", float(np.log2(ratio)))
 
 
-def words_of(found: CameraFigures) -> dict[str, str]:
+def _words_of(found: CameraFigures) -> list[tuple[str, str]]:
     """Figures in words, by their names; one in several units is one entry."""
-    words: dict[str, str] = {}
+    words: dict[str, list[str]] = {}
     for each in figures_of(found):
-        before = f"{words[each.name]}, " if each.name in words else ""
-        words[each.name] = before + each.words
-    return words
+        words.setdefault(each.name, []).append(f"{each.number} {each.unit}".strip())
+    return [(name, ", ".join(values)) for name, values in words.items()]
 
 
 def camera_parts(name: str, planes: dict[str, CameraFigures]) -> list[Part]:
@@ -102,7 +101,7 @@ def camera_parts(name: str, planes: dict[str, CameraFigures]) -> list[Part]:
             what=f"EMVA 1288 release 4.0 linear, {len(found.photons)} levels",
             findings=found.findings,
             checks=[],
-            figures=[*words_of(found).items()],
+            figures=_words_of(found),
             maps=[mapped(each, largest) for each in _maps(found)],
             plots=[*map(drawn, _curves(found))],
             tables=[_levels(found)],
