@@ -290,21 +290,10 @@ def _on_quantisation(found: CameraFigures) -> str | None:
     )
 
 
-def _on_spatial(found: CameraFigures) -> str | None:
-    """Say that non-uniformity was not measured."""
-    if found.spatial is not None:
-        return None
-    return (
-        "DSNU and PRNU are not measured: give many frames at half of saturation "
-        "and as many without light, in a table [spatial] of a camera.toml"
-    )
-
-
 _CAMERA: tuple[Rule[CameraFigures], ...] = (
     Rule("unit", "input", _on_unit),
     Rule("saturation", "input", _on_saturation),
     Rule("quantisation", "input", _on_quantisation, severity="note"),
-    Rule("spatial", "input", _on_spatial, severity="note"),
 )
 """What is asked of the figures of a camera."""
 

@@ -291,12 +291,17 @@ class Manifest(Table):
         return [(each.name, each.frames) for each in self.exposure]
 
 
-class CameraExposure(Table):
+class Series(Table):
+    """Frames with light, and as many without: ``[spatial]`` of a camera.toml."""
+
+    frames: Files
+    dark: Files
+
+
+class CameraExposure(Series):
     """One ``[[exposure]]`` of a camera.toml: a level of light, and its dark."""
 
     name: str = ""
-    frames: Files
-    dark: Files
     exposure_s: NotNegative
     photons: NotNegative | None = None
     irradiance_uw_cm2: NotNegative | None = None
@@ -315,13 +320,6 @@ class CameraLight(Table):
     pixel_um: Positive
 
 
-class Spatial(Table):
-    """Table ``[spatial]``: many frames at half of saturation, and as many without light."""
-
-    frames: Files
-    dark: Files
-
-
 class CameraManifest(Table):
     """The whole camera.toml."""
 
@@ -329,7 +327,7 @@ class CameraManifest(Table):
     sensor: Sensor = Sensor()
     light: CameraLight | None = None
     exposure: Annotated[list[CameraExposure], Field(min_length=2)]
-    spatial: Spatial | None = None
+    spatial: Series | None = None
 
     @model_validator(mode="after")
     def _figures_of_all_pixels(self) -> Self:
@@ -346,10 +344,10 @@ class CameraManifest(Table):
         return self
 
     @property
-    def series(self) -> list[tuple[str, CameraExposure | Spatial]]:
+    def series(self) -> list[tuple[str, Series]]:
         """Each exposure by its name, or its number, and the frames for the non-uniformity."""
-        exposures = [(each.name or str(index), each) for index, each in enumerate(self.exposure)]
-        return [*exposures, *([] if self.spatial is None else [("spatial", self.spatial)])]
+        spatial: list[tuple[str, Series]] = [("spatial", self.spatial)] if self.spatial else []
+        return [(each.name or str(k), each) for k, each in enumerate(self.exposure)] + spatial
 
     @property
     def measurements(self) -> list[tuple[str, str | list[str]]]:
