@@ -11,6 +11,7 @@ from equipix import simulate
 from equipix.exposures.exposures import Exposures
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Positions
+from equipix.io.tiff import write_frames
 from equipix.measured.measured import measured_of
 
 SMALL = (9, 12)
@@ -74,3 +75,48 @@ def written_experiment(folder, shape, shifts, **options):
     beam = simulate.gaussian_beam(shape, width=150)
     virtual = simulate.experiment(sensitivity, beam, shifts, frames=4, rng=rng, **options)
     return virtual.write(folder / "experiment")
+
+
+CAMERA = {"gain": 0.25, "read": 8.0, "efficiency": 0.6, "well": 14_000.0, "current": 2000.0}
+"""A virtual camera: DN per electron, e-, electrons per photon, e-, e-/s."""
+
+
+def camera_levels(rng, shape=(48, 64), count=14, frames=2, efficiency=None, **changed):
+    """Frames of levels with light and without, photons, exposure times of a virtual camera."""
+    truth = CAMERA | changed
+    rng = np.random.default_rng(rng)
+    camera = simulate.Camera(
+        sensitivity=np.ones(shape),
+        gain_dn_per_e=truth["gain"],
+        read_noise_e=truth["read"],
+        full_well_e=truth["well"],
+    )
+    efficiency = np.broadcast_to(truth["efficiency"] if efficiency is None else efficiency, shape)
+    photons = np.linspace(0.02, 1.2, count) * truth["well"] / truth["efficiency"]
+    times = photons / 1e6
+    stacks, levels = [], [*zip(photons, times, strict=True)]
+    for lit in (1, 0):
+        electrons = (lit * n * efficiency + truth["current"] * t for n, t in levels)
+        stacks.append([np.stack([*camera.frames(e, frames, rng=rng)]) for e in electrons])
+    return *stacks, photons, times
+
+
+def written_camera(folder, rng=1, *, spatial=16, cfa=None, **options):
+    """Write levels of a virtual camera, and frames at half of saturation; return the manifest."""
+    bright, dark, photons, times = camera_levels(rng, **options)
+    photons, times = photons.tolist(), times.tolist()
+    lines = ["[sensor]", "bit_depth = 12", *([f'cfa = "{cfa}"'] if cfa else [])]
+    for k, level in enumerate(photons):
+        for name, stacks in (("b", bright), ("d", dark)):
+            write_frames(folder / f"{name}{k}.tif", stacks[k], nbytes=stacks[k].nbytes)
+        lines += ["[[exposure]]", f'frames = "b{k}.tif"', f'dark = "d{k}.tif"']
+        lines += [f"photons = {level!r}", f"exposure_s = {times[k]!r}"]
+    if spatial:
+        half = len(photons) // 2
+        stacks = camera_levels([rng, 1], **options | {"frames": spatial})
+        for name, each in zip("bd", stacks, strict=False):
+            write_frames(folder / f"{name}.tif", each[half], nbytes=each[half].nbytes)
+        lines += ["[spatial]", 'frames = "b.tif"', 'dark = "d.tif"']
+    path = folder / "camera.toml"
+    path.write_text("\n".join(lines))
+    return path

@@ -26,8 +26,10 @@ from equipix import metrics
 from equipix.cli.app import app
 from equipix.diagnosis.inputs import BEFORE
 from equipix.diagnosis.rules import AFTER, LAST
-from equipix.experiment.manifest import LevelManifest, Manifest, Sensor
+from equipix.experiment.manifest import CameraManifest, LevelManifest, Manifest, Sensor
 from equipix.findings import WARNINGS
+from equipix.report.camera import figures_of
+from given import written_camera
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
@@ -99,6 +101,8 @@ def test_the_manifests_of_the_pages_are_valid():
     assert len(Sensor.model_validate(tomllib.loads(region)["sensor"]).region) == 1
     (levels,) = blocks("toml", "docs/nuc.md")
     assert len(LevelManifest.model_validate(tomllib.loads(levels)).level) == 1
+    (camera,) = blocks("toml", "docs/camera.md")
+    assert len(CameraManifest.model_validate(tomllib.loads(camera)).exposure) == 2
 
 
 def manifest_keys(model: type[BaseModel] = Manifest, within: str = "") -> dict[str, str]:
@@ -135,6 +139,20 @@ def test_the_page_describes_every_key_of_an_experiment_and_its_default():
     rows = table("key", "docs/experiment.md")
     described = {key.split("`")[1]: given for key, _, given, _ in rows}
     assert described == manifest_keys()
+
+
+def test_the_page_describes_every_key_of_a_camera_and_its_default():
+    rows = table("key", "docs/camera.md")
+    described = {key.split("`")[1]: given for key, _, given, _ in rows}
+    refused = tuple(f"sensor.{key}" for key in ("saturation", "gain_dn_per_e", "mask", "region"))
+    keys = manifest_keys(CameraManifest).items()
+    assert described == {key: given for key, given in keys if not key.startswith(refused)}
+
+
+def test_the_page_describes_every_figure_of_a_camera(tmp_path):
+    (found,) = equipix.CameraExperiment.load(written_camera(tmp_path)).figures().values()
+    cells = " ".join(cell for _, cell, _ in table("figure | key in `--json`", "docs/camera.md"))
+    assert {*re.findall(r"`(\w+)`", cells)} == {each.key for each in figures_of(found)}
 
 
 def test_the_errors_of_the_page_are_those_of_the_example(capsys):

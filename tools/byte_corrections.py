@@ -140,6 +140,21 @@ def level_files(keys: str = "", *, dark: bool = True, **options: Any) -> Any:
     return {"": equipix.LevelExperiment.load("levels.toml").run(**options)}
 
 
+def camera_files(keys: str = "") -> Any:
+    """Figures of a camera by levels in files."""
+    lines = [f"[sensor]\nbit_depth = 14\n{keys}"]
+    for number, light in enumerate(LIGHT):
+        for name, frames in (("on", raw_frames(light, 2, number)), ("off", raw_frames(0, 2, 50))):
+            write(f"{name}{number}.tif", frames)
+        lines.append(f'[[exposure]]\nframes = "on{number}.tif"\ndark = "off{number}.tif"')
+        lines.append(f"photons = {8 * light}\nexposure_s = {light / 1e5}")
+    for name, light in (("half", 6000.0), ("dark", 0.0)):
+        write(f"{name}.tif", raw_frames(light, 16, seed=60))
+    lines.append('[spatial]\nframes = "half.tif"\ndark = "dark.tif"')
+    Path("camera.toml").write_text("\n".join(lines))
+    return equipix.CameraExperiment.load("camera.toml").figures()
+
+
 STATES = np.array([(t, v) for t in np.linspace(-20.0, 60.0, 6) for v in (1.95, 2.05)])
 """Temperatures and biases of a bolometer array."""
 
@@ -465,6 +480,8 @@ CASES: dict[str, Callable[[], Any]] = {
     "nuc, files without a dark": lambda: level_files(
         "region = [{rows = [0, 2]}]", dark=False, order="auto", mask=mask()
     ),
+    "camera, files": camera_files,
+    "camera, colours": lambda: camera_files('cfa = "RG/RG"'),
     "bolometer, order": lambda: dynamic(order=3),
     "bolometer, predicted order": lambda: dynamic(averaged=True),
     "bolometer, inverse": lambda: dynamic(order=2, regressor="inverse", mask=mask()),

@@ -8,6 +8,7 @@ from importlib import import_module
 
 _HOMES = {
     "Calibration": "calibration.result",
+    "CameraExperiment": "experiment.camera",
     "Correction": "correction.protocol",
     "Corrector": "correction.apply",
     "Experiment": "experiment.experiment",

@@ -16,6 +16,7 @@ from equipix.correction.apply import Corrector as Corrector
 from equipix.correction.polynomial import Polynomial as Polynomial
 from equipix.correction.polynomial import combine as combine
 from equipix.correction.protocol import Correction as Correction
+from equipix.experiment.camera import CameraExperiment as CameraExperiment
 from equipix.experiment.experiment import Experiment as Experiment
 from equipix.experiment.level_experiment import LevelExperiment as LevelExperiment
 from equipix.exposures.spots import cross_pattern as cross_pattern

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import json
 import re
 import tomllib
 from html.parser import HTMLParser
@@ -17,6 +18,7 @@ from equipix.errors import FileError
 from equipix.report.limits import LimitsFile, limits_template, read_limits
 from equipix.report.maps import Map, maps_of
 from equipix.report.page import page, part_of
+from given import written_camera
 
 NOTHING = LimitsFile()
 
@@ -239,3 +241,66 @@ def test_notebooks_show_results(results):
 def test_notebooks_without_the_libraries_show_words(results, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "jinja2", None)
     assert results["calibration"]._repr_html_() is None
+
+
+class TestCamera:
+    def test_writes_a_page_of_all_figures(self, tmp_path, run):
+        out = tmp_path / "camera.html"
+        status, printed, told = run("emva", written_camera(tmp_path), "-o", out)
+        assert (status, told) == (0, "")
+        text = out.read_text(encoding="utf-8")
+        checked = Checked(text)
+        assert checked.open == []
+        assert all(each.startswith("data:image/png;base64,") for each in checked.addresses)
+        figures = re.findall(r'<th scope="row">([^<]*)</th><td>([^<]*)</td></tr>', text)
+        _, *listed = re.findall(r"^ +(\S.*?)  +(?:(\S+) +)?(\S.*?) *$", printed, re.MULTILINE)
+        assert len(listed) > 25
+        words = dict(figures)
+        for name, unit, number in listed:
+            assert f"{number} {unit}".strip() in words[name].split(", ")
+        for title in (
+            *("Responsivity", "Photon transfer", "Deviation from linearity", "Mean of the dark"),
+            *("Signal-to-noise ratio", "Spectrum of dark signal", "Profiles of photo response"),
+            "Histogram of photo response, high-passed",
+        ):
+            assert f'aria-label="{title}"' in text
+        assert text.count('class="map"') == 2
+        status, _, told = run("emva", tmp_path, "-o", out)
+        assert status == 1
+        assert "exists" in told
+
+    def test_planes_are_parts_and_columns(self, tmp_path, run):
+        path, out = written_camera(tmp_path, cfa="RGGB", count=6, spatial=0), tmp_path / "it.html"
+        status, printed, told = run("emva", path, "-o", out)
+        assert (status, told) == (0, "")
+        text = out.read_text(encoding="utf-8")
+        for plane in ("R", "G1", "G2", "B"):
+            assert f", plane {plane}</h2>" in text
+        assert re.search(r"figure +unit +R +G1 +G2 +B", printed)
+        found = json.loads(run("emva", path, "--json")[1])
+        assert [*found] == ["output", "R", "G1", "G2", "B"]
+        assert found["R"]["gain_dn_per_e"] == pytest.approx(0.25, rel=0.2)
+        assert found["B"]["findings"] == []
+
+    def test_what_is_not_known_is_null(self, tmp_path, run):
+        path = written_camera(tmp_path, count=6, spatial=0)
+        path.write_text(re.sub(r"exposure_s = .*", "exposure_s = 0.01", path.read_text()))
+        found = json.loads(run("emva", path, "--json")[1])
+        assert found["dark_current_mean_e_per_s"] is None
+        assert not any(key.startswith(("dsnu", "prnu")) for key in found)
+
+    @pytest.mark.parametrize("name", ["out.pdf", "camera.toml"])
+    def test_outputs_that_are_no_page_are_refused(self, tmp_path, run, name):
+        path = written_camera(tmp_path, count=6, spatial=0)
+        status, _, told = run("emva", path, "-o", tmp_path / name, "--force")
+        assert status == 1
+        assert "ends in none of .html" in told
+
+
+def test_curves_take_the_colour_of_the_text(results):
+    """Letters without a fill of their own are black, also on a dark screen."""
+    part = part_of("cal", results["calibration"], NOTHING)
+    assert "figure svg { fill: currentColor; }" in page([part], "One")
+    for plot in part.plots:
+        legend = plot["svg"].partition('id="legend')[2]
+        assert "fill: #ffffff" not in legend

@@ -1,4 +1,4 @@
-"""What both kinds of manifest share: averages, masks, provenance."""
+"""What all kinds of manifest share: averages, masks, provenance."""
 
 import os
 from collections.abc import Mapping
@@ -13,7 +13,14 @@ from numpy.typing import ArrayLike
 from equipix._check import EXPOSURES, Bools, Progress, Words, as_mask, naming_memory, staged, union
 from equipix.errors import FileError, InputError
 from equipix.experiment.image_files import check_formats, image_files, refuse_repeats, sha256_of
-from equipix.experiment.manifest import Dark, LevelManifest, Manifest, entry_files, read_manifest
+from equipix.experiment.manifest import (
+    CameraManifest,
+    Dark,
+    LevelManifest,
+    Manifest,
+    entry_files,
+    read_manifest,
+)
 from equipix.io.formats import read_mask
 from equipix.io.paths import as_path
 from equipix.measured.average import average
@@ -22,7 +29,7 @@ from equipix.measured.means import Averaged
 from equipix.measured.noise import NoiseModel
 from equipix.measured.statistics import FrameStatistics, refuse_subtracted
 
-_Manifest = TypeVar("_Manifest", Manifest, LevelManifest)
+_Manifest = TypeVar("_Manifest", Manifest, LevelManifest, CameraManifest)
 
 
 @dataclass(frozen=True)
@@ -33,7 +40,7 @@ class Described(Generic[_Manifest]):
     ----------
     path : Path
         The file that describes them.
-    manifest : Manifest or LevelManifest
+    manifest : Manifest, LevelManifest or CameraManifest
         Its checked content.
     """
 
@@ -65,10 +72,15 @@ class Described(Generic[_Manifest]):
             does not exist, or one file for two measurements.
         """
         file = as_path("path", path)
-        described = cls(file, read_manifest(file, cls._model))
+        described = cls(file, cls._read(file))
         described.files()
         refuse_repeats(file, described.manifest)
         return described
+
+    @classmethod
+    def _read(cls, file: Path) -> Any:
+        """Read and check the content of the description."""
+        return read_manifest(file, cls._model)
 
     def files(self) -> list[Path]:
         """All image files, each once."""
@@ -83,16 +95,19 @@ class Described(Generic[_Manifest]):
         dark: FrameStatistics | None,
         workers: int | None,
         progress: Progress | None,
+        mask: Bools | None = None,
     ) -> FrameStatistics:
         """Average the files of an entry; `name` is for the progress."""
         sensor, files = self.manifest.sensor, entry_files(self.path, entry)
         level = sensor.saturation_level
         stage = staged(progress, f"averaging {name}")
-        found = average(files, dark=dark, saturation=level, workers=workers, progress=stage)
-        if sensor.largest is not None and found.mean.max() > sensor.largest:
+        found = average(
+            files, dark=dark, saturation=level, mask=mask, workers=workers, progress=stage
+        )
+        if sensor.largest is not None and np.nanmax(found.mean, initial=0) > sensor.largest:
             raise FileError(
                 f"{self.path}: '{files[0].name}' of {name} holds means up to "
-                f"{found.mean.max():.0f} DN, above {sensor.largest}, the largest value "
+                f"{np.nanmax(found.mean):.0f} DN, above {sensor.largest}, the largest value "
                 f"that 'bit_depth' = {sensor.bit_depth} holds: correct 'bit_depth' in [sensor]"
             )
         return found

@@ -10,7 +10,7 @@ import numpy as np
 
 from equipix._check import Array
 from equipix.errors import FileError
-from equipix.experiment.manifest import LevelManifest, Manifest, entry_files
+from equipix.experiment.manifest import AnyManifest, CameraManifest, LevelManifest, entry_files
 from equipix.io.arrays import split
 from equipix.io.formats import refuse_saved
 from equipix.io.frames import frame_format, read_frames
@@ -61,28 +61,31 @@ class Entry(NamedTuple):
 
 
 def refuse_repeats(
-    path: Path, manifest: Manifest | LevelManifest, hashes: Mapping[Path, str] | None = None
+    path: Path, manifest: AnyManifest, hashes: Mapping[Path, str] | None = None
 ) -> None:
     """Refuse a file that stands for two measurements, by its name or, with `hashes`, its content.
 
     One image of the aperture may serve for two moves: it is after the one and before the other.
-    Dark frames may be equal, as those of a camera that shows 0 in the dark.
+    Dark frames may be equal, as those of a camera that shows 0 in the dark. Those of a camera.toml
+    may serve for several exposures.
 
     Raises
     ------
     FileError
         With the file and where it stands.
     """
-    entries = [*_entries(path, manifest)]
+    entries = [*entries_of(path, manifest)]
+    marks = hashes or _resolved(file for entry in entries for file in entry.files)
     for entry in entries:
         if hashes is None or entry.key != "dark":
-            for one, other in _alike(entry.files, entry.files, hashes):
+            for one, other in _alike(entry.files, entry.files, marks):
                 raise FileError(f"{path}: {_words(one, other)} twice in {entry}")
     for first, second in combinations(entries, 2):
         images = "aperture" in first.key and "aperture" in second.key
-        if images and first.exposure != second.exposure:
+        darks = first.key == second.key == "dark"
+        if darks or (images and first.exposure != second.exposure):
             continue
-        for one, other in _alike(first.files, second.files, hashes):
+        for one, other in _alike(first.files, second.files, marks):
             raise FileError(
                 f"{path}: {_words(one, other)} in {first} and in {second}: give each its own frames"
             )
@@ -99,23 +102,29 @@ def refuse_repeated_files(frames: list[Path], dark: list[Path]) -> dict[Path, st
         With the file and where it stands.
     """
     found = sha256_of([*frames, *dark])
-    for hashes in (None, found):
-        for one, other in _alike(frames, frames, hashes):
+    for marks in (_resolved([*frames, *dark]), found):
+        for one, other in _alike(frames, frames, marks):
             raise FileError(f"{_words(one, other)} twice in the frames: give each once")
-        for one, other in _alike(frames, dark, hashes):
+        for one, other in _alike(frames, dark, marks):
             raise FileError(
                 f"{_words(one, other)} in the frames and in 'dark': give each its own frames"
             )
     return found
 
 
-def image_files(path: Path, manifest: Manifest | LevelManifest) -> list[Path]:
+def image_files(path: Path, manifest: AnyManifest) -> list[Path]:
     """List the files of all measurements, each once."""
-    return list(dict.fromkeys(file for entry in _entries(path, manifest) for file in entry.files))
+    return list(dict.fromkeys(file for entry in entries_of(path, manifest) for file in entry.files))
 
 
-def _entries(path: Path, manifest: Manifest | LevelManifest) -> Iterator[Entry]:
+def entries_of(path: Path, manifest: AnyManifest) -> Iterator[Entry]:
     """Give the keys that name files of measurements, with the files."""
+    if isinstance(manifest, CameraManifest):
+        for name, each in manifest.series:
+            kind = "table" if each is manifest.spatial else "exposure"
+            yield Entry("frames", name, entry_files(path, each.frames), kind)
+            yield Entry("dark", name, entry_files(path, each.dark), kind)
+        return
     if manifest.dark is not None:
         yield Entry("dark", "", entry_files(path, manifest.dark.frames))
     if isinstance(manifest, LevelManifest):
@@ -129,11 +138,15 @@ def _entries(path: Path, manifest: Manifest | LevelManifest) -> Iterator[Entry]:
                 yield Entry(key, exposure.name, entry_files(path, entry))
 
 
+def _resolved(files: Iterable[Path]) -> dict[Path, Path]:
+    """Places of files, whatever their names."""
+    return {file: file.resolve() for file in files}
+
+
 def _alike(
-    first: list[Path], second: list[Path], hashes: Mapping[Path, str] | None
+    first: list[Path], second: list[Path], marks: Mapping[Path, object]
 ) -> Iterator[tuple[Path, Path]]:
-    """Give the pairs of the same file, or of the same content; within a list if both are one."""
-    marks = {file: file.resolve() if hashes is None else hashes[file] for file in [*first, *second]}
+    """Give the pairs of files with the same mark; within a list if both are one."""
     seen = {} if second is first else {marks[file]: file for file in reversed(first)}
     for file in second:
         if marks[file] in seen:

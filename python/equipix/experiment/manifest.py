@@ -1,4 +1,4 @@
-"""The content of experiment.toml and levels.toml, checked: errors name the value and its place."""
+"""The content of manifests, checked: errors name the value and its place."""
 
 import tomllib
 from pathlib import Path
@@ -27,7 +27,7 @@ _WANTED = {
     "centre": "[row, col] in pixels",
     "radius": "a positive number of pixels",
     "outside": "true or false",
-    "dark": "a table",
+    "dark": "a table, or files in a camera.toml",
     "exposure": "two or more tables [[exposure]]",
     "level": "one or more tables [[level]]",
     "value": "a number",
@@ -42,6 +42,13 @@ _WANTED = {
     "flux_std": "a positive number, relative to the flux",
     "time": "a number of seconds",
     "rotation": "0, 90, 180 or 270",
+    "exposure_s": "a number of seconds, not negative",
+    "photons": "a number of photons per pixel, not negative",
+    "irradiance_uw_cm2": "a number of µW/cm², not negative",
+    "light": "a table",
+    "wavelength_nm": "a positive number of nanometres",
+    "pixel_um": "a positive number of micrometres",
+    "spatial": "a table",
 }
 
 KEYS = frozenset(_WANTED)
@@ -49,13 +56,15 @@ KEYS = frozenset(_WANTED)
 
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 
+NotNegative = Annotated[FiniteFloat, Field(ge=0)]
+
 Text = Annotated[str, Field(min_length=1)]
 
 Files = Text | Annotated[list[Text], Field(min_length=1)]
 
 Pair = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
 
-Errors = Annotated[list[Annotated[FiniteFloat, Field(ge=0)]], Field(min_length=2, max_length=2)]
+Errors = Annotated[list[NotNegative], Field(min_length=2, max_length=2)]
 
 Span = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=2, max_length=2)]
 
@@ -282,8 +291,75 @@ class Manifest(Table):
         return [(each.name, each.frames) for each in self.exposure]
 
 
+class Series(Table):
+    """Frames with light, and as many without: ``[spatial]`` of a camera.toml."""
+
+    frames: Files
+    dark: Files
+
+
+class CameraExposure(Series):
+    """One ``[[exposure]]`` of a camera.toml: a level of light, and its dark."""
+
+    name: str = ""
+    exposure_s: NotNegative
+    photons: NotNegative | None = None
+    irradiance_uw_cm2: NotNegative | None = None
+
+    @model_validator(mode="after")
+    def _one_light(self) -> Self:
+        if (self.photons is None) == (self.irradiance_uw_cm2 is None):
+            raise _problem("give either 'photons' or 'irradiance_uw_cm2'")
+        return self
+
+
+class CameraLight(Table):
+    """Table ``[light]``: what turns an irradiance into photons per pixel."""
+
+    wavelength_nm: Positive
+    pixel_um: Positive
+
+
+class CameraManifest(Table):
+    """The whole camera.toml."""
+
+    format: Literal[1] = 1
+    sensor: Sensor = Sensor()
+    light: CameraLight | None = None
+    exposure: Annotated[list[CameraExposure], Field(min_length=2)]
+    spatial: Series | None = None
+
+    @model_validator(mode="after")
+    def _figures_of_all_pixels(self) -> Self:
+        for key in ("saturation", "gain_dn_per_e", "mask", "region"):
+            if getattr(self.sensor, key) is not None:
+                raise _problem(
+                    f"'{key}' in [sensor] is not for a camera.toml: the figures are of all pixels, "
+                    "and gain and saturation are measured"
+                )
+        if self.light is None and any(each.photons is None for each in self.exposure):
+            raise _problem(
+                "'irradiance_uw_cm2' needs a table [light] with 'wavelength_nm' and 'pixel_um'"
+            )
+        return self
+
+    @property
+    def series(self) -> list[tuple[str, Series]]:
+        """Each exposure by its name, or its number, and the frames for the non-uniformity."""
+        spatial: list[tuple[str, Series]] = [("spatial", self.spatial)] if self.spatial else []
+        return [(each.name or str(k), each) for k, each in enumerate(self.exposure)] + spatial
+
+    @property
+    def measurements(self) -> list[tuple[str, str | list[str]]]:
+        """Name and frames of each exposure."""
+        return [(name, each.frames) for name, each in self.series]
+
+
+AnyManifest = Manifest | LevelManifest | CameraManifest
+
+
 def read_manifest(path: Path, model: type[_Content]) -> _Content:
-    """Read and check the experiment.toml or levels.toml `path`."""
+    """Read and check the experiment.toml, levels.toml or camera.toml `path`."""
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
@@ -293,6 +369,11 @@ def read_manifest(path: Path, model: type[_Content]) -> _Content:
         raise FileError(f"{path}: line {line} is no UTF-8: save it as UTF-8, as TOML is") from None
     except tomllib.TOMLDecodeError as error:
         raise FileError(f"{path}: is not valid TOML: {error}") from error
+    return checked_content(path, content, model)
+
+
+def checked_content(path: Path, content: dict[str, Any], model: type[_Content]) -> _Content:
+    """Check the content of a manifest; messages name `path`."""
     try:
         return model.model_validate(content)
     except ValidationError as error:

@@ -6,7 +6,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from equipix._check import ArrayLike, Bools, Floats, as_array, check_type, naming_memory, number
+from equipix._check import (
+    ArrayLike,
+    Bools,
+    Floats,
+    as_array,
+    check_count,
+    check_type,
+    naming_memory,
+    number,
+    one_or_each,
+)
 from equipix.errors import InputError
 from equipix.findings import Finding, say
 from equipix.measured.statistics import FrameStatistics
@@ -177,17 +187,23 @@ def _roots(variances: Floats) -> Split:
 _LOWER = 0.05
 """Fall of the signal where the light rises, above which light and levels do not belong together."""
 
-_MOST_EFFICIENT = 1.1
+MOST_EFFICIENT = 1.1
 """Largest quantum efficiency that may be one, with its error: a photon frees one electron."""
 
 _SEQUENCES = (list, tuple, np.ndarray)
 """Types of a sequence of levels: a text, and one average, are none."""
 
-_TRANSFER = 0.7
+TRANSFER = 0.7
 """Highest signal, over that at saturation, that counts for gain and responsivity."""
 
-_LINEAR = (0.05, 0.95)
+LINEAR = (0.05, 0.95)
 """Lowest and highest signal, over that at saturation, that count for the linearity."""
+
+QUANTISED = 0.24
+"""Least variance of a dark signal in DN²: below it quantisation hides the noise."""
+
+_TIMES = 3
+"""Fewest exposure times of which a dark current is determined."""
 
 
 @dataclass(frozen=True)
@@ -211,6 +227,15 @@ class EmvaTransfer:
         Signal, less the dark, at the level of the largest temporal noise.
     linearity_error : float
         Mean of the absolute relative deviations from a line, from 5 to 95 % of saturation.
+    line : tuple of float
+        Offset in DN and slope of that line.
+    saturation_light : float
+        Light at saturation: the saturation capacity in photons, where the light is in photons.
+    dark_noise_dn : float
+        Temporal noise of a frame without light, quantisation included, in DN.
+    dark_current_mean, dark_current_variance : float
+        Electrons per second by the means and by the variances of the darks; NaN without three
+        exposure times.
     """
 
     gain_dn_per_e: float
@@ -219,6 +244,57 @@ class EmvaTransfer:
     quantum_efficiency: float
     saturation_dn: float
     linearity_error: float
+    line: tuple[float, float]
+    saturation_light: float
+    dark_noise_dn: float
+    dark_current_mean: float
+    dark_current_variance: float
+
+    @property
+    def saturation_e(self) -> float:
+        """Saturation capacity in electrons."""
+        return self.responsivity / self.gain_dn_per_e * self.saturation_light
+
+    @property
+    def threshold_e(self) -> float:
+        """Absolute sensitivity threshold in electrons: the signal equals its noise."""
+        dark = max(self.dark_noise_dn**2, QUANTISED) / self.gain_dn_per_e**2
+        return float(np.sqrt(dark + 0.25) + 0.5)
+
+    @property
+    def threshold_light(self) -> float:
+        """Absolute sensitivity threshold in photons, where the light is in photons."""
+        return self.threshold_e * self.gain_dn_per_e / self.responsivity
+
+    @property
+    def snr_max(self) -> float:
+        """Signal over noise at saturation, of photon noise alone."""
+        return float(np.sqrt(self.saturation_e))
+
+    @property
+    def dynamic_range(self) -> float:
+        """Saturation capacity over absolute sensitivity threshold."""
+        return self.saturation_light / self.threshold_light
+
+    def snr(self, light: ArrayLike, dsnu_e: float = 0.0, prnu: float = 0.0) -> Floats:
+        """Signal over noise by the model of the camera.
+
+        Parameters
+        ----------
+        light : array_like
+            Light, in the unit of the levels.
+        dsnu_e, prnu : float
+            Non-uniformity that counts as noise: in electrons, and relative to the signal.
+
+        Returns
+        -------
+        ndarray, of the shape of `light`
+            The ratio.
+        """
+        electrons = self.responsivity / self.gain_dn_per_e * np.asarray(light, np.float64)
+        dark = max(self.dark_noise_dn**2, QUANTISED) / self.gain_dn_per_e**2
+        noise = dark + dsnu_e**2 + electrons + (prnu * electrons) ** 2
+        return np.asarray(electrons / np.sqrt(noise))
 
 
 @naming_memory("photon transfer")
@@ -226,8 +302,10 @@ def emva_transfer(
     frames: Sequence[ArrayLike | FrameStatistics],
     dark: Sequence[ArrayLike | FrameStatistics],
     light: ArrayLike,
+    *,
+    exposure_s: ArrayLike | None = None,
 ) -> EmvaTransfer:
-    r"""Photon-transfer gain, read noise, responsivity and linearity error.
+    r"""Photon-transfer gain, read noise, saturation, sensitivity threshold and linearity error.
 
     Parameters
     ----------
@@ -236,11 +314,14 @@ def emva_transfer(
         or one for all.
     light : array_like, shape (levels,)
         Light of each level: photons per pixel, or in any unit.
+    exposure_s : array_like, shape (levels,), optional
+        Exposure time of each level and its dark, in seconds. Where three or more differ, the noise
+        without light is that at the time 0, and there is a dark current.
 
     Returns
     -------
     EmvaTransfer
-        K, R, read noise, saturation and linearity error.
+        K, R, read noise, saturation, sensitivity threshold, dynamic range and linearity error.
 
     Raises
     ------
@@ -261,6 +342,17 @@ def emva_transfer(
     level of the largest temporal variance. The line of the linearity error minimises relative
     deviations, Σ (y − a − b·light)²/y² [1]_.
 
+    With η = R/K, the noise σ_d without light in electrons and that of quantisation σ_q² = 1/12 DN²
+
+    .. math::
+       \mu_{p.min} = \left(\sqrt{\sigma_d^2 + \sigma_q^2/K^2 + 1/4} + 1/2\right) / \eta, \quad
+       \mathrm{SNR}_{max} = \sqrt{\eta \mu_{p.sat}}, \quad
+       \mathrm{DR} = \mu_{p.sat} / \mu_{p.min} .
+
+    There a variance without light counts as 0.24 DN² at least. The dark current is the slope of
+    the means of the darks over the exposure time, divided by K, and that of their variances,
+    divided by K².
+
     References
     ----------
     .. [1] European Machine Vision Association, "EMVA Standard 1288", release 4.0 linear, 2021.
@@ -276,14 +368,32 @@ def emva_transfer(
     if not (np.isfinite(levels).all() and (levels >= 0).all()):
         wrong = levels[~(np.isfinite(levels) & (levels >= 0))][0]
         raise InputError(f"'light' holds {wrong:g}, expected finite numbers not below 0")
-    off = np.array([_mean_and_variance("dark", each) for each in dark])
-    on = np.array([_mean_and_variance("frames", each) for each in frames])
+    times = None
+    if exposure_s is not None:
+        times = one_or_each("exposure_s", exposure_s, levels.shape, ndim=(1,))
+        check_count("dark", len(dark), len(levels), "value of 'exposure_s'")
+    off = np.array([mean_and_variance("dark", each) for each in dark])
+    on = np.array([mean_and_variance("frames", each) for each in frames])
+    found = transfer_of(on, off, levels, times)
+    efficiency = found.responsivity / found.gain_dn_per_e
+    if np.isnan(found.quantum_efficiency):
+        words = (
+            f"'light' gives a quantum efficiency of {efficiency:.4g} (limit {MOST_EFFICIENT:g}), "
+            "so it is NaN: light in photons per pixel and exposure gives one; in another unit the "
+            "responsivity is in DN per that unit"
+        )
+        say(Finding("unit", words, "input"))
+    return found
+
+
+def transfer_of(on: Floats, off: Floats, levels: Floats, times: Floats | None) -> EmvaTransfer:
+    """Evaluate means and variances (levels, 2) with light and without; see `emva_transfer`."""
     signal, variance = (on - off).T
     _refuse_dark(off[:, 0], on[:, 0])
     largest = int(np.argmax(on[:, 1]))
     saturation = float(signal[largest])
-    below = signal <= _TRANSFER * saturation
-    linear = (signal >= _LINEAR[0] * saturation) & (signal <= _LINEAR[1] * saturation)
+    below = signal <= TRANSFER * saturation
+    linear = (signal >= LINEAR[0] * saturation) & (signal <= LINEAR[1] * saturation)
     if np.count_nonzero(linear) < 3 or not (signal[below] > 0).any():
         raise InputError(
             f"'frames': {np.count_nonzero(linear)} levels lie between 5 and 95 % of saturation at "
@@ -301,18 +411,29 @@ def emva_transfer(
     responsivity = _slope(levels[below], signal[below])
     if not gain > 0:
         raise InputError(f"'frames': the noise does not rise with the signal, the gain is {gain:g}")
-    read = float(off[:, 1].mean()) - 1 / 12
+    dark_variance, slopes = float(off[:, 1].mean()), np.full(2, np.nan)
+    if times is not None and len(np.unique(times)) >= _TIMES:
+        slopes, (_, dark_variance) = np.polyfit(times, off, 1)
+    efficiency = responsivity / gain
+    line = _line(levels[linear], signal[linear])
+    fitted = line[0] + line[1] * levels[linear]
     return EmvaTransfer(
         gain,
-        signed_root(read) / gain,
+        signed_root(float(dark_variance) - 1 / 12) / gain,
         responsivity,
-        _efficiency(responsivity / gain),
+        efficiency if efficiency <= MOST_EFFICIENT else float("nan"),
         saturation,
-        _linearity_error(levels[linear], signal[linear]),
+        float(np.mean(np.abs(signal[linear] - fitted) / fitted)),
+        line,
+        float(levels[largest]),
+        signed_root(float(dark_variance)),
+        float(slopes[0] / gain),
+        float(slopes[1] / gain**2),
     )
 
 
-def _mean_and_variance(name: str, frames: ArrayLike | FrameStatistics) -> tuple[float, float]:
+def mean_and_variance(name: str, frames: ArrayLike | FrameStatistics) -> tuple[float, float]:
+    """Mean of all values, and temporal variance of one frame."""
     found = moments(name, frames)
     return float(found.mean.mean()), found.variance
 
@@ -341,27 +462,13 @@ def _refuse_falling(light: Floats, signal: Floats, linear: Bools) -> None:
         )
 
 
-def _efficiency(found: float) -> float:
-    """Quantum efficiency, unless it is none."""
-    if found <= _MOST_EFFICIENT:
-        return found
-    words = (
-        f"'light' gives a quantum efficiency of {found:.4g} (limit {_MOST_EFFICIENT:g}), so it is "
-        "NaN: light in photons per pixel and exposure gives one; in another unit the responsivity "
-        "is in DN per that unit"
-    )
-    say(Finding("unit", words, "input"))
-    return float("nan")
-
-
 def _slope(x: Floats, y: Floats) -> float:
     """Slope of the least-squares line through 0."""
     return float(x @ y / (x @ x))
 
 
-def _linearity_error(light: Floats, signal: Floats) -> float:
-    """Mean absolute relative deviation from the line of least relative deviations."""
+def _line(light: Floats, signal: Floats) -> tuple[float, float]:
+    """Offset and slope of the line of least relative deviations."""
     design = np.stack([1 / signal, light / signal], axis=1)
     (offset, slope), *_ = np.linalg.lstsq(design, np.ones(len(signal)), rcond=None)
-    line = offset + slope * light
-    return float(np.mean(np.abs(signal - line) / line))
+    return float(offset), float(slope)

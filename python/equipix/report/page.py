@@ -5,10 +5,10 @@ from __future__ import annotations
 import base64
 import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -24,7 +24,10 @@ from equipix.report.figures import summary, words_of
 from equipix.report.limits import Check, Limits, LimitsFile, checked
 from equipix.report.maps import Map, flagged, maps_of
 
-_LARGEST = 480
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+LARGEST = 480
 """Most rows and columns of a map on a page of one result."""
 
 _CELL = 160
@@ -92,7 +95,7 @@ def cell(result: Any) -> str:
     return _rendered(
         "cell.html",
         what=repr(result).strip("<>"),
-        map=_map(first, _CELL),
+        map=mapped(first, _CELL),
         figures=words_of(summary(result)),
         findings=getattr(result, "findings", ()),
     )
@@ -118,16 +121,19 @@ def part_of(name: str, result: Any, limits: LimitsFile, *, share: int = 1) -> Pa
     if flags is not None:
         figures["flagged_share"] = float(np.mean(~usable(flags)))
     maps = maps_of(result)
+    curves = curves_of(result, maps[0])
+    if flags is not None and flags.any():
+        curves.insert(0, partial(draw_flags, flags=flags))
     return Part(
         name=name,
         what=repr(result).strip("<>"),
         findings=findings,
         checks=checked(_limits_of(result, limits), figures, findings),
         figures=words_of(figures),
-        maps=[_map(each, int(_LARGEST / share**0.5)) for each in maps],
-        plots=[*_plots(result, maps[0])],
+        maps=[mapped(each, int(LARGEST / share**0.5)) for each in maps],
+        plots=[*map(drawn, curves)],
         tables=[*_tables(result)],
-        provenance=_provenance(getattr(result, "metadata", {})),
+        provenance=provenance_of(getattr(result, "metadata", {})),
     )
 
 
@@ -137,7 +143,7 @@ def _limits_of(result: Any, limits: LimitsFile) -> Limits:
     return kinds.get(type(result), limits.correction)
 
 
-def _map(shown: Map, largest: int) -> dict[str, Any]:
+def mapped(shown: Map, largest: int = LARGEST) -> dict[str, Any]:
     """Picture, values and words of a map."""
     values, step = shown.reduced(largest)
     low, high = limits_of(shown, values)
@@ -180,21 +186,18 @@ def _picture(values: Floats, low: float, high: float, cmap: str) -> str:
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
-def _plots(result: Any, first: Map) -> Iterator[dict[str, str]]:
-    """Curves of a result as drawings that take the colour of the text around them."""
-    draws = curves_of(result, first)
-    flags = getattr(result, "flags", None)
-    if flags is not None and flags.any():
-        draws.insert(0, partial(draw_flags, flags=flags))
-    for draw in draws:
-        figure = new_figure(5.2, 3.8)
-        axes = figure.subplots()
-        draw(axes)
-        buffer = io.StringIO()
-        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
-        svg = buffer.getvalue()
-        svg = svg[svg.index("<svg") :].replace("#000000", "currentColor")
-        yield {"title": axes.get_title(), "svg": svg}
+def drawn(draw: Callable[[Axes], None]) -> dict[str, str]:
+    """Make a drawing that takes the colour of the text around it."""
+    figure = new_figure(5.2, 3.8)
+    axes = figure.subplots()
+    draw(axes)
+    if (legend := axes.get_legend()) is not None:
+        legend.set_frame_on(False)  # its white would hide the text in the dark
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    svg = buffer.getvalue()
+    svg = svg[svg.index("<svg") :].replace("#000000", "currentColor")
+    return {"title": axes.get_title(), "svg": svg}
 
 
 def _tables(result: Any) -> Iterator[Table]:
@@ -279,13 +282,13 @@ def _words(flag: Flag) -> str:
     return (flag.name or "").replace("_", " ").lower()
 
 
-def _provenance(metadata: Mapping[str, Any], above: str = "") -> list[tuple[str, str]]:
+def provenance_of(metadata: Mapping[str, Any], above: str = "") -> list[tuple[str, str]]:
     """Entries of the metadata by their places, those of tables within tables one by one."""
     found: list[tuple[str, str]] = []
     for key, value in metadata.items():
         name = f"{above}{key.replace('_', ' ')}"
         if isinstance(value, Mapping):
-            found += _provenance(value, f"{name}: ")
+            found += provenance_of(value, f"{name}: ")
         else:
             found.append((name, value if isinstance(value, str) else json.dumps(value)))
     return found

@@ -1,0 +1,388 @@
+"""A camera under levels of light, as camera.toml or an EMVA 1288 descriptor describes it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from os import PathLike
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+
+from equipix._check import Floats, Ints, Progress, ReadOnly, naming_memory
+from equipix.detector.photons import EV_UM
+from equipix.errors import FileError, InputError
+from equipix.experiment.described import Described
+from equipix.experiment.image_files import check_formats, entries_of, sha256_of
+from equipix.experiment.manifest import (
+    CameraExposure,
+    CameraLight,
+    CameraManifest,
+    checked_content,
+)
+from equipix.findings import Finding, Rule, ask, say
+from equipix.io.paths import as_path
+from equipix.measured.colour import Colours
+from equipix.measured.statistics import FrameStatistics
+from equipix.metrics.emva import (
+    MOST_EFFICIENT,
+    QUANTISED,
+    EmvaSpatial,
+    EmvaTransfer,
+    emva_spatial,
+    mean_and_variance,
+    transfer_of,
+)
+from equipix.metrics.maps import planes
+
+_DESCRIPTOR = "EMVA1288_Data.txt"
+
+_FALLEN = 0.9
+"""Variance at the brightest level over the largest, up to which it has fallen by saturation."""
+
+_JOULE_PER_EV = 1.602176634e-19
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFigures(ReadOnly):
+    """Figures of a camera, or of one plane of its colour filters.
+
+    Attributes
+    ----------
+    transfer : EmvaTransfer
+        Gain, noise, saturation, sensitivity threshold, linearity, dark current.
+    spatial : EmvaSpatial or None
+        DSNU in electrons and PRNU; None without frames for them.
+    photons, exposure_s : ndarray, shape (n,)
+        Photons per pixel and exposure time of each level.
+    on, off : ndarray, shape (n, 2)
+        Mean and temporal variance of each level with light and without it, in DN and DN².
+    bright, dark : ndarray, shape (rows, cols), or None
+        Mean of the frames of `spatial`, in DN.
+    findings : tuple of Finding
+        What limits the figures.
+    metadata : dict
+        Where they come from.
+    """
+
+    transfer: EmvaTransfer
+    spatial: EmvaSpatial | None
+    photons: Floats
+    exposure_s: Floats
+    on: Floats
+    off: Floats
+    bright: Floats | None
+    dark: Floats | None
+    findings: tuple[Finding, ...] = ()
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class CameraExperiment(Described[CameraManifest]):
+    """Frames of a camera under levels of light, as files on disk.
+
+    Attributes
+    ----------
+    path : Path
+        The camera.toml, or the EMVA1288_Data.txt.
+    manifest : CameraManifest
+        Its checked content.
+
+    See Also
+    --------
+    equipix.metrics.emva_transfer : Figures of frames in memory.
+    equipix.metrics.emva_spatial : Non-uniformity of frames in memory.
+
+    Notes
+    -----
+    An EMVA1288_Data.txt describes the public sets of EMVA 1288: lines ``b exposure_ns photons`` and
+    ``d exposure_ns``, each followed by ``i image`` lines. Two images are a level, more are those of
+    the non-uniformity; the dark of a level is that of its exposure time.
+    """
+
+    _model = CameraManifest
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Self:
+        """Read and check the description.
+
+        Parameters
+        ----------
+        path : str or path
+            The camera.toml or the EMVA1288_Data.txt, or a folder that holds one of them.
+
+        Returns
+        -------
+        CameraExperiment
+            What `figures` evaluates.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be read, has an unknown key or a wrong value, or names a file that
+            does not exist, or one file for two levels; if a level has no light or no dark.
+        """
+        file = as_path("path", path)
+        if file.is_dir():
+            found = [file / name for name in (_DESCRIPTOR, "camera.toml") if (file / name).exists()]
+            if len(found) != 1:
+                held = "both" if found else "neither"
+                raise FileError(f"{file}: holds {held} {_DESCRIPTOR} and camera.toml, expected one")
+            file = found[0]
+        return super().load(file)
+
+    @classmethod
+    def _read(cls, file: Path) -> Any:
+        if file.suffix.lower() != ".txt":
+            return super()._read(file)
+        return checked_content(file, _described(file), CameraManifest)
+
+    def figures(
+        self, *, workers: int | None = None, progress: Progress | None = None
+    ) -> dict[str, CameraFigures]:
+        """Evaluate the files after EMVA 1288, release 4.0 linear.
+
+        Parameters
+        ----------
+        workers : int, optional
+            Number of threads; by default one for each processor.
+        progress : callable, optional
+            Called as ``progress(done, total, stage)`` repeatedly.
+
+        Returns
+        -------
+        dict of str to CameraFigures
+            By the plane of the colour filters, as `equipix.metrics.planes` names it; by an empty
+            text without filters.
+
+        Raises
+        ------
+        FileError
+            If a file cannot be read, images differ in size or depth, or the levels do not determine
+            the figures.
+        InsufficientMemoryError
+            If the memory that it takes cannot be had.
+
+        Warns
+        -----
+        InputWarning
+            If saturation is not reached, or the photons give no quantum efficiency.
+
+        Notes
+        -----
+        The frames of a level are reduced to their mean and variance when they are read, so memory
+        does not grow with their number. Files of a sensor with filters are read once for each
+        plane.
+        """
+        shape = self._shape()
+        colours = Colours.of(self.manifest.sensor.cfa)
+        places = {"": np.arange(shape[0] * shape[1]).reshape(shape)}
+        if colours is not None:
+            places = planes(places[""], colours)
+        origin = self._provenance(sha256_of([self.path, *self.files()]), None)
+        with naming_memory("averaging"):
+            found = {
+                plane: self._evaluated(plane, partial(self._mean, place, shape, workers), progress)
+                for plane, place in places.items()
+            }
+        say(*(each for one in found.values() for each in one.findings))
+        return {plane: replace(one, metadata=origin) for plane, one in found.items()}
+
+    def _mean(
+        self,
+        place: Ints,
+        shape: tuple[int, int],
+        workers: int | None,
+        at: str,
+        files: str | list[str],
+    ) -> FrameStatistics:
+        """Average the frames of an entry in the pixels of a plane, as an image of their own."""
+        mask = np.ones(shape, bool)
+        mask.flat[place] = False
+        # With a mask a saved average loses the light between its frames.
+        found = self._statistics(at, files, None, workers, None, mask if mask.any() else None)
+        maps: dict[str, Any] = {name: each.flat[place] for name, each in found.maps.items()}
+        return replace(found, **maps)
+
+    def _shape(self) -> tuple[int, int]:
+        """Rows and columns that all images have."""
+        entries = [*entries_of(self.path, self.manifest)]
+        for entry in entries:
+            try:
+                shape = check_formats([entries[0].files[0], *entry.files])
+            except FileError as error:
+                raise FileError(f"{self.path}, {entry}: {error}") from error
+        return shape
+
+    def _evaluated(
+        self, plane: str, read: Callable[[str, Any], FrameStatistics], progress: Progress | None
+    ) -> CameraFigures:
+        """Evaluate one plane."""
+        exposures, entry = self.manifest.exposure, self.manifest.spatial
+        photons = np.array([_photons(each, self.manifest.light) for each in exposures])
+        times = np.array([each.exposure_s for each in exposures])
+        on, off = curve = np.empty((2, len(exposures), 2))
+        spatial = bright = dark = None
+        at = ""
+        try:
+            for k, (name, each) in enumerate(self.manifest.series[: len(exposures)]):
+                for j, key in enumerate(("frames", "dark")):
+                    at = f"'{key}' of exposure '{name}'"
+                    curve[j, k] = mean_and_variance(key, read(at, getattr(each, key)))
+                if progress is not None:
+                    progress(k + 1, len(exposures), f"averaging levels {plane}".strip())
+            at = f"plane {plane}" if plane else "levels"
+            transfer = transfer_of(on, off, photons, times)
+            if entry is not None:
+                at = "[spatial]"
+                stacks = read(at, entry.frames), read(at, entry.dark)
+                spatial = emva_spatial(*stacks, gain_dn_per_e=transfer.gain_dn_per_e)
+                bright, dark = (each.mean for each in stacks)
+        except InputError as error:
+            raise FileError(f"{self.path}, {at}: {error}") from error
+        found = CameraFigures(transfer, spatial, photons, times, on, off, bright, dark)
+        of = f"plane {plane}: " if plane else ""
+        said = (replace(each, message=of + each.message) for each in ask(_CAMERA, found))
+        return replace(found, findings=tuple(said))
+
+
+def _photons(exposure: CameraExposure, light: CameraLight | None) -> float:
+    """Photons per pixel: given, or E A t λ/(h c)."""
+    if exposure.photons is not None or light is None or exposure.irradiance_uw_cm2 is None:
+        return float(exposure.photons or 0.0)
+    joule = exposure.irradiance_uw_cm2 * 1e-14 * light.pixel_um**2 * exposure.exposure_s
+    return joule * light.wavelength_nm * 1e-3 / (EV_UM * _JOULE_PER_EV)
+
+
+def _on_unit(found: CameraFigures) -> str | None:
+    """Say that the photons free more electrons than there are photons."""
+    efficiency = found.transfer.responsivity / found.transfer.gain_dn_per_e
+    if efficiency <= MOST_EFFICIENT:
+        return None
+    return (
+        f"the quantum efficiency is {efficiency:.4g} (limit {MOST_EFFICIENT:g}), so "
+        "it is left out: see that the light is in photons per pixel and exposure, or in µW/cm², "
+        "and the pixel in µm"
+    )
+
+
+def _on_saturation(found: CameraFigures) -> str | None:
+    """Say that the noise does not fall towards the brightest level."""
+    share = found.on[found.on[:, 0].argmax(), 1] / found.on[:, 1].max()
+    if not share > _FALLEN:
+        return None
+    return (
+        f"the variance at the brightest level is {share:.0%} of the largest (limit {_FALLEN:.0%}), "
+        "so saturation is not reached: saturation capacity, SNR and dynamic range are lower "
+        "bounds. Add levels with more light, up to where the noise falls"
+    )
+
+
+def _on_quantisation(found: CameraFigures) -> str | None:
+    """Say that the noise of the dark is hidden by rounding."""
+    noise, least = found.transfer.dark_noise_dn, QUANTISED**0.5
+    if noise >= least:
+        return None
+    return (
+        f"the temporal dark noise is {noise:.3g} DN, and quantisation hides noise "
+        f"below {least:.2g} DN: sensitivity threshold and dynamic range count {least:.2g} DN. Use "
+        "a higher gain of the camera"
+    )
+
+
+_CAMERA: tuple[Rule[CameraFigures], ...] = (
+    Rule("unit", "input", _on_unit),
+    Rule("saturation", "input", _on_saturation),
+    Rule("quantisation", "input", _on_quantisation, severity="note"),
+)
+"""What is asked of the figures of a camera."""
+
+
+class _Group(NamedTuple):
+    """Lines of a descriptor: one of ``b`` or ``d`` with its place, and its images."""
+
+    kind: str
+    at: str
+    values: list[float]
+    files: list[str]
+
+    @property
+    def series(self) -> tuple[float, bool]:
+        """Exposure time in ns, and whether it is of more than two images."""
+        return self.values[0], len(self.files) > 2
+
+
+_LINES = {
+    "n": "bits, columns and rows",
+    "b": "exposure time in ns and photons per pixel",
+    "d": "exposure time in ns",
+}
+"""What follows each kind of line."""
+
+
+def _described(path: Path) -> dict[str, Any]:
+    """Content of a camera.toml that says what a descriptor says."""
+    groups = _groups(path)
+    darks = {group.series: group for group in groups if group.kind == "d"}
+    content: dict[str, Any] = {"sensor": {}, "exposure": []}
+    for group in groups:
+        if group.kind == "n":
+            content["sensor"] = {"bit_depth": int(group.values[0])}
+        if group.kind != "b":
+            continue
+        dark = darks.get(group.series)
+        if dark is None:
+            raise FileError(
+                f"{path}, {group.at}: there are no dark images of {group.values[0]:g} ns, expected "
+                "as many as bright ones"
+            )
+        time, photons = group.values
+        files = {"frames": group.files, "dark": dark.files}
+        if group.series[1]:
+            content.setdefault("spatial", files)
+        else:
+            level = {"name": group.at, "exposure_s": time / 1e9, "photons": photons}
+            content["exposure"].append(level | files)
+    return content
+
+
+def _groups(path: Path) -> list[_Group]:
+    """Read the lines of a descriptor; images must exist."""
+    groups: list[_Group] = []
+    try:
+        lines = path.read_text(encoding="utf-8-sig", errors="surrogateescape").splitlines()
+    except OSError as error:
+        raise FileError(f"{path}: cannot be read: {error.strerror}") from error
+    for number, line in enumerate(map(str.strip, lines), 1):
+        kind, _, rest = line.partition(" ")
+        if kind in _LINES:
+            groups.append(_Group(kind, f"line {number}", _numbers(path, number, line), []))
+        elif kind == "i" and groups:
+            name = rest.strip().replace("\\", "/")
+            if not (path.parent / name).is_file():
+                raise FileError(f"{path}, line {number}: '{name}' does not exist")
+            groups[-1].files.append(name)
+        elif kind[:1] not in ("", "#", "v"):
+            raise FileError(
+                f"{path}, line {number}: holds {line!r}, expected a line of n, b, d, i, v or #"
+            )
+    for group in groups:
+        if group.kind != "n" and len(group.files) < 2:
+            raise FileError(
+                f"{path}, {group.at}: names {len(group.files)} images, expected two or more"
+            )
+    return groups
+
+
+def _numbers(path: Path, number: int, line: str) -> list[float]:
+    """Numbers of a line, as many as it must hold."""
+    kind, *words = line.split()
+    try:
+        values = [float(word.replace(",", ".")) for word in words]
+    except ValueError:
+        values = []
+    if len(values) != {"n": 3, "b": 2, "d": 1}[kind]:
+        raise FileError(
+            f"{path}, line {number}: holds {line!r}, expected '{kind}' with {_LINES[kind]}"
+        )
+    return values

@@ -1,0 +1,235 @@
+"""The figures of a camera as EMVA 1288 lists them, and the curves beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from equipix._check import Floats
+from equipix.experiment.camera import CameraFigures
+from equipix.metrics.emva import LINEAR, TRANSFER, Split, high_passed
+from equipix.report.drawing import draw_histogram, draw_spectrum
+from equipix.report.maps import Map
+from equipix.report.page import LARGEST, Part, Table, drawn, mapped, provenance_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+_WHOLE = 1e4
+"""Values from here on are written as whole numbers."""
+
+_FINE: Any = {"linewidth": 0.8}
+
+
+class Figure(NamedTuple):
+    """A figure: its key, its name and unit for people, and its value, NaN where it is not known."""
+
+    key: str
+    name: str
+    unit: str
+    value: float
+
+    @property
+    def number(self) -> str:
+        """The value in digits."""
+        if not np.isfinite(self.value):
+            return "not known"
+        return f"{self.value:{'.0f' if abs(self.value) >= _WHOLE else '.4g'}}"
+
+
+def figures_of(found: CameraFigures) -> Iterator[Figure]:
+    """List all figures, those of the non-uniformity where it was measured."""
+    t = found.transfer
+    yield Figure("gain_dn_per_e", "system gain K", "DN/e⁻", t.gain_dn_per_e)
+    yield Figure("inverse_gain_e_per_dn", "1/K", "e⁻/DN", 1 / t.gain_dn_per_e)
+    yield Figure("responsivity_dn_per_photon", "responsivity R", "DN/photon", t.responsivity)
+    efficiency = 100 * t.quantum_efficiency
+    yield Figure("quantum_efficiency_percent", "quantum efficiency η", "%", efficiency)
+    yield Figure("dark_noise_dn", "temporal dark noise with quantisation", "DN", t.dark_noise_dn)
+    yield Figure("dark_noise_e", "temporal dark noise σ_d", "e⁻", t.read_noise_e)
+    yield from _with_logarithms("snr_max", "largest SNR", t.snr_max)
+    yield Figure("inverse_snr_max_percent", "inverse of the largest SNR", "%", 100 / t.snr_max)
+    for key, name, photons, electrons in (
+        ("threshold", "absolute sensitivity threshold", t.threshold_light, t.threshold_e),
+        ("saturation", "saturation capacity", t.saturation_light, t.saturation_e),
+    ):
+        yield Figure(f"{key}_photons", name, "photons", photons)
+        yield Figure(f"{key}_e", name, "e⁻", electrons)
+    yield from _with_logarithms("dynamic_range", "dynamic range", t.dynamic_range)
+    if found.spatial is not None:
+        dsnu, prnu = found.spatial.dsnu, found.spatial.prnu
+        yield Figure("dsnu_dn", "DSNU", "DN", dsnu.total * t.gain_dn_per_e)
+        yield from _parts("dsnu", "_e", "e⁻", dsnu)
+        yield from _parts("prnu", "_percent", "%", Split(*(100 * each for each in prnu)))
+    yield Figure("linearity_error_percent", "linearity error", "%", 100 * t.linearity_error)
+    for by in ("mean", "variance"):
+        current = getattr(t, f"dark_current_{by}")
+        yield Figure(f"dark_current_{by}_e_per_s", f"dark current by the {by}", "e⁻/s", current)
+
+
+def _parts(kind: str, ending: str, unit: str, split: Split) -> Iterator[Figure]:
+    yield Figure(kind + ending, kind.upper(), unit, split.total)
+    for part in ("row", "column", "pixel"):
+        value = getattr(split, part)
+        yield Figure(f"{kind}_{part}{ending}", f"{kind.upper()}, {part}", unit, value)
+
+
+def _with_logarithms(key: str, name: str, ratio: float) -> Iterator[Figure]:
+    yield Figure(key, name, "", ratio)
+    yield Figure(f"{key}_db", name, "dB", float(20 * np.log10(ratio)))
+    yield Figure(f"{key}_bits", name, "bit", float(np.log2(ratio)))
+
+
+def _words_of(found: CameraFigures) -> list[tuple[str, str]]:
+    """Figures in words, by their names; one in several units is one entry."""
+    words: dict[str, list[str]] = {}
+    for each in figures_of(found):
+        words.setdefault(each.name, []).append(f"{each.number} {each.unit}".strip())
+    return [(name, ", ".join(values)) for name, values in words.items()]
+
+
+def camera_parts(name: str, planes: dict[str, CameraFigures]) -> list[Part]:
+    """Collect what a page says of a camera: a part for each plane of its colour filters."""
+    largest, last = int(LARGEST / len(planes) ** 0.5), [*planes][-1]
+    return [
+        Part(
+            name=f"{name}, plane {plane}" if plane else name,
+            what=f"EMVA 1288 release 4.0 linear, {len(found.photons)} levels",
+            findings=found.findings,
+            checks=[],
+            figures=_words_of(found),
+            maps=[mapped(each, largest) for each in _maps(found)],
+            plots=[*map(drawn, _curves(found))],
+            tables=[_levels(found)],
+            provenance=provenance_of(found.metadata) if plane == last else [],
+        )
+        for plane, found in planes.items()
+    ]
+
+
+def _maps(found: CameraFigures) -> list[Map]:
+    """Deviations of pixels from the mean: of the dark signal, and of the response to light."""
+    if found.bright is None or found.dark is None:
+        return []
+    light = found.bright - found.dark
+    return [
+        Map("Dark signal", "DN", found.dark - found.dark.mean(), "deviation"),
+        Map("Photo response", "%", 100 * (light / light.mean() - 1), "deviation"),
+    ]
+
+
+def _levels(found: CameraFigures) -> Table:
+    """Means and variances, level by level."""
+    columns = (found.photons, found.exposure_s, *found.on.T, *found.off.T, _ratio(found))
+    rows = [
+        tuple(f"{each:.5g}" if np.isfinite(each) else "none" for each in row)
+        for row in zip(*columns, strict=True)
+    ]
+    head = ("Photons", "Exposure, s", "Mean, DN", "Variance, DN²", "Dark, DN", "Its variance, DN²")
+    return Table("Levels", (*head, "SNR"), rows, "Variances are temporal, of one frame.")
+
+
+def _signal(found: CameraFigures) -> Floats:
+    return np.asarray(found.on[:, 0] - found.off[:, 0])
+
+
+def _ratio(found: CameraFigures) -> Floats:
+    """Signal over noise of each level, NaN above saturation, where noise is cut off."""
+    below = (found.photons <= found.transfer.saturation_light) & (found.on[:, 1] > 0)
+    return np.where(below, _signal(found) / np.sqrt(np.where(below, found.on[:, 1], 1)), np.nan)
+
+
+def _curves(found: CameraFigures) -> Iterator[Callable[[Axes], None]]:
+    """Functions that draw the curves."""
+    for draw in (_draw_responsivity, _draw_transfer, _draw_linearity, _draw_snr):
+        yield partial(draw, found=found)
+    if np.isfinite(found.transfer.dark_current_mean):
+        for column in (0, 1):
+            yield partial(_draw_dark, found=found, column=column)
+    for shown in _maps(found):
+        yield partial(draw_spectrum, shown=shown)
+        for axis in (0, 1):
+            yield partial(_draw_profiles, shown=shown, axis=axis)
+        if shown.unit == "%":  # light that changes slowly over the sensor hides single pixels
+            passed = high_passed(shown.values.astype(np.float64))
+            shown = Map(f"{shown.name}, high-passed", "%", passed)
+        yield partial(draw_histogram, shown=shown)
+
+
+def _draw_line(axes: Axes, x: Floats, y: Floats, slope: float, unit: str) -> None:
+    """Draw points with a line through 0, and where the points end that it was fitted to."""
+    axes.plot(x, y, "o", markersize=3, label="measured")
+    axes.axline((0, 0), slope=slope, color="C1", label=f"fit: {slope:.5g} {unit}", **_FINE)
+    axes.set_ylim(0, 1.1 * y.max())
+    axes.legend(fontsize="small")
+
+
+def _draw_responsivity(axes: Axes, found: CameraFigures) -> None:
+    t = found.transfer
+    _draw_line(axes, found.photons, _signal(found), t.responsivity, "DN/photon")
+    axes.axhline(TRANSFER * t.saturation_dn, color="gray", **_FINE)
+    axes.set(title="Responsivity", ylabel="mean less dark, DN")
+    axes.set_xlabel(f"photons per pixel; line: {TRANSFER:.0%} of saturation, end of the fit")
+
+
+def _draw_transfer(axes: Axes, found: CameraFigures) -> None:
+    t, variance = found.transfer, found.on[:, 1] - found.off[:, 1]
+    _draw_line(axes, _signal(found), variance, t.gain_dn_per_e, "DN/e⁻")
+    axes.axvline(TRANSFER * t.saturation_dn, color="gray", **_FINE)
+    axes.set(title="Photon transfer", ylabel="variance less dark, DN²")
+    axes.set_xlabel(f"mean less dark, DN; line: {TRANSFER:.0%} of saturation, end of the fit")
+
+
+def _draw_linearity(axes: Axes, found: CameraFigures) -> None:
+    """Draw deviations from the line of the linearity error, over the levels that it counts."""
+    (offset, slope), share = found.transfer.line, _signal(found) / found.transfer.saturation_dn
+    counts = (share >= LINEAR[0]) & (share <= LINEAR[1])
+    photons, signal = found.photons[counts], _signal(found)[counts]
+    deviation = 100 * (signal / (offset + slope * photons) - 1)
+    axes.plot(photons, deviation, "o-", markersize=3, **_FINE)
+    axes.axhline(0, color="gray", **_FINE)
+    axes.set(title="Deviation from linearity", xlabel="photons per pixel", ylabel="%")
+
+
+def _draw_snr(axes: Axes, found: CameraFigures) -> None:
+    """Draw signal over noise: measured, by the model, and of an ideal sensor."""
+    t, ratio = found.transfer, _ratio(found)
+    axes.loglog(found.photons[ratio > 0], ratio[ratio > 0], "o", markersize=3, label="measured")
+    at = np.geomspace(t.threshold_light / 2, t.saturation_light, 200)
+    axes.loglog(at, t.snr(at), label="model", **_FINE)
+    if found.spatial is not None:
+        total = t.snr(at, found.spatial.dsnu.total, found.spatial.prnu.total)
+        axes.loglog(at, total, "--", label="with DSNU and PRNU", **_FINE)
+    axes.loglog(at, np.sqrt(at), ":", color="gray", label="ideal sensor", **_FINE)
+    axes.axvline(t.threshold_light, color="gray", **_FINE)
+    axes.axvline(t.saturation_light, color="gray", **_FINE)
+    axes.set(title="Signal-to-noise ratio", ylabel="signal over noise")
+    axes.set_xlabel("photons per pixel; lines: threshold, saturation")
+    axes.legend(fontsize="small")
+
+
+def _draw_dark(axes: Axes, found: CameraFigures, column: int) -> None:
+    """Draw means, or variances, of the darks over the exposure time, with their line."""
+    times, values = found.exposure_s, found.off[:, column]
+    axes.plot(times, values, "o", markersize=3)
+    axes.plot(times, np.polyval(np.polyfit(times, values, 1), times), **_FINE)
+    name, unit = (("Mean", "DN"), ("Variance", "DN²"))[column]
+    axes.set(title=f"{name} of the dark", xlabel="exposure time, s", ylabel=unit)
+
+
+def _draw_profiles(axes: Axes, shown: Map, axis: int) -> None:
+    """Draw largest, middle, mean and smallest value of the columns, or of the rows."""
+    values = shown.values
+    middle = values.take(values.shape[axis] // 2, axis)
+    axes.plot(values.max(axis), label="largest", **_FINE)
+    axes.plot(middle, label="middle", **_FINE)
+    axes.plot(values.mean(axis), label="mean", **_FINE)
+    axes.plot(values.min(axis), label="smallest", **_FINE)
+    axes.set(title=f"Profiles of {shown.name.lower()}", xlabel=("column", "row")[axis])
+    axes.set_ylabel(shown.unit)
+    axes.margins(y=0.2)
+    axes.legend(fontsize="small", loc="upper center", ncols=4)

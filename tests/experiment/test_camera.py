@@ -1,0 +1,366 @@
+"""Cameras under levels of light: figures of EMVA 1288 against plain NumPy, truth and laws."""
+
+from __future__ import annotations
+
+import json
+import tracemalloc
+import warnings
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import equipix
+from equipix import CameraExperiment, errors, metrics
+from equipix.io.frames import read_frames
+from equipix.io.tiff import write_frames
+from given import CAMERA, camera_levels, written_camera
+from reference import emva
+
+SEEDS = 12
+
+
+@pytest.fixture(scope="module")
+def camera(tmp_path_factory):
+    return written_camera(tmp_path_factory.mktemp("camera"))
+
+
+def figures(path):
+    (found,) = CameraExperiment.load(path).figures().values()
+    return found
+
+
+@pytest.fixture(scope="module")
+def found():
+    """Figures of the virtual camera, from several draws of its noise."""
+    levels = (camera_levels(seed) for seed in range(SEEDS))
+    return [
+        metrics.emva_transfer(on, off, photons, exposure_s=times)
+        for on, off, photons, times in levels
+    ]
+
+
+class TestTruth:
+    @pytest.mark.parametrize(
+        ("name", "true"),
+        [
+            ("gain_dn_per_e", CAMERA["gain"]),
+            ("read_noise_e", CAMERA["read"]),
+            ("quantum_efficiency", CAMERA["efficiency"]),
+            ("dark_noise_dn", np.sqrt((0.25 * 8) ** 2 + 1 / 12)),
+            ("dark_current_mean", CAMERA["current"]),
+            ("dark_current_variance", CAMERA["current"]),
+            ("threshold_e", np.sqrt(8**2 + 1 / 12 / 0.25**2 + 0.25) + 0.5),
+            ("threshold_light", (np.sqrt(8**2 + 1 / 12 / 0.25**2 + 0.25) + 0.5) / 0.6),
+        ],
+    )
+    def test_it_comes_back_within_its_standard_error(self, found, name, true):
+        values = [getattr(each, name) for each in found]
+        error = np.std(values, ddof=1) / np.sqrt(SEEDS)
+        # Student's t of 11 degrees of freedom is above 4.4 once in a thousand times.
+        assert np.mean(values) == pytest.approx(true, abs=4.4 * error)
+        assert error < 0.1 * true
+
+    def test_saturation_is_that_of_the_well_but_for_the_distance_of_levels(self, found):
+        step = 1.18 / 13 * CAMERA["well"]
+        for each in found:
+            assert CAMERA["well"] - step < each.saturation_e < CAMERA["well"] + step
+            assert each.snr_max == pytest.approx(np.sqrt(each.saturation_e))
+            ratio = each.saturation_light / each.threshold_light
+            assert each.dynamic_range == pytest.approx(ratio)
+
+    def test_at_the_threshold_the_signal_equals_its_noise(self, found):
+        for each in found:
+            assert each.snr(each.threshold_light) == pytest.approx(1)
+            # Of many photons their noise alone is left, and of many more the unequal pixels.
+            assert each.snr(1e9) == pytest.approx(
+                np.sqrt(each.snr_max**2 * 1e9 / each.saturation_light), rel=1e-4
+            )
+            assert each.snr(1e15, prnu=0.01) == pytest.approx(100, rel=1e-4)
+
+    def test_dark_noise_below_that_of_quantisation_counts_as_049_dn(self):
+        levels = camera_levels(3, read=0.0, current=0.0)
+        found = metrics.emva_transfer(*levels[:3], exposure_s=levels[3])
+        assert found.dark_noise_dn < 0.4
+        assert found.threshold_e == pytest.approx(
+            np.sqrt(0.24 / found.gain_dn_per_e**2 + 0.25) + 0.5
+        )
+
+    def test_without_three_exposure_times_there_is_no_dark_current(self):
+        on, off, photons, times = camera_levels(4)
+        for given in (None, np.full(len(times), 0.01), np.resize([0.01, 0.02], len(times))):
+            found = metrics.emva_transfer(on, off, photons, exposure_s=given)
+            assert np.isnan([found.dark_current_mean, found.dark_current_variance]).all()
+            noise = np.mean([emva.pair_moments(pair)[1] for pair in off])
+            assert found.dark_noise_dn == pytest.approx(np.sqrt(noise))
+
+    @pytest.mark.parametrize(
+        ("darks", "times", "words"),
+        [
+            (14, np.ones(13), r"'exposure_s' has shape \(13,\), expected \(14,\)"),
+            (14, np.full(14, np.nan), "'exposure_s' holds nan"),
+            (1, np.ones(14), "'dark' has 1 entries, expected 14"),
+        ],
+    )
+    def test_wrong_times_are_refused(self, darks, times, words):
+        on, off, photons, _ = camera_levels(4)
+        with pytest.raises(errors.InputError, match=words):
+            metrics.emva_transfer(on, off[:darks], photons, exposure_s=times)
+
+
+def pillow(files):
+    return [np.asarray(Image.open(file)) for file in files]
+
+
+@pytest.mark.data
+def test_a_real_camera_has_the_figures_of_plain_numpy(data_dir, run):
+    folder = data_dir / "emva1288-set001-ccd-12bit"
+    groups = []
+    for line in (folder / "EMVA1288_Data.txt").read_text().splitlines():
+        kind, *words = line.split()
+        if kind in ("b", "d"):
+            groups.append((kind, [float(word) for word in words], []))
+        elif kind == "i":
+            groups[-1][2].append(folder / words[0].replace("\\", "/"))
+    pairs = {
+        kind: [each for each in groups if each[0] == kind and len(each[2]) == 2] for kind in "bd"
+    }
+    bright, dark = ([pillow(each[2]) for each in pairs[kind]] for kind in "bd")
+    many = {each[0]: pillow(each[2]) for each in groups if len(each[2]) == 50}
+    seconds, photons = np.array([each[1] for each in pairs["b"]]).T * [[1e-9], [1]]
+    wanted = emva.figures(bright, dark, photons, seconds, many["b"], many["d"])
+    status, out, told = run("emva", folder, "--json")
+    assert (status, told) == (0, "")
+    found = json.loads(out)
+    assert (found.pop("output"), found.pop("findings")) == ("none", [])
+    assert found.keys() == wanted.keys()
+    # Sums of 15 million values in another order: some roundings of variances of 1e-2 of means.
+    assert found == pytest.approx(wanted, rel=1e-8)
+    # The figures in the README of the data, as far as their digits go.
+    assert found["gain_dn_per_e"] == pytest.approx(0.28006, abs=5e-6)
+    assert found["responsivity_dn_per_photon"] == pytest.approx(0.126727, abs=5e-7)
+    assert found["quantum_efficiency_percent"] == pytest.approx(45.249, abs=5e-4)
+    assert found["prnu_percent"] == pytest.approx(0.262, abs=5e-4)
+    assert found["linearity_error_percent"] == pytest.approx(0.297, abs=5e-4)
+
+
+def test_files_have_the_figures_of_their_frames(camera):
+    found = figures(camera)
+    on, off, photons, times = camera_levels(1)
+    wanted = metrics.emva_transfer(on, off, photons, exposure_s=times)
+    np.testing.assert_allclose(
+        list(vars(found.transfer).values())[:6], list(vars(wanted).values())[:6], rtol=1e-9
+    )
+    spatial = metrics.emva_spatial(
+        *(read_frames(camera.parent / name) for name in ("b.tif", "d.tif")),
+        gain_dn_per_e=wanted.gain_dn_per_e,
+    )
+    np.testing.assert_allclose(found.spatial.prnu, spatial.prnu, rtol=1e-6)
+    assert found.findings == ()
+    assert len(found.metadata["inputs"]) == 2 * 14 + 2 + 1
+
+
+def test_each_plane_of_the_filters_has_its_own_figures(tmp_path):
+    efficiency = np.tile([[0.3, 0.6], [0.55, 0.2]], (24, 32))
+    path = written_camera(tmp_path, 5, cfa="RGGB", efficiency=efficiency)
+    with pytest.warns(errors.InputWarning, match="plane [RB]: .* saturation is not reached"):
+        found = CameraExperiment.load(path).figures()
+    assert [*found] == ["R", "G1", "G2", "B"]
+    on, off, photons, times = camera_levels(5, efficiency=efficiency)
+    for k, each in enumerate(found.values()):
+        cut = np.s_[:, k // 2 :: 2, k % 2 :: 2]
+        wanted = metrics.emva_transfer(
+            [s[cut] for s in on], [s[cut] for s in off], photons, exposure_s=times
+        )
+        assert each.transfer.gain_dn_per_e == pytest.approx(wanted.gain_dn_per_e, rel=1e-9)
+        assert each.transfer.responsivity == pytest.approx(wanted.responsivity, rel=1e-9)
+        # 768 pixels: a variance has 5 %, and eight levels average it.
+        assert each.transfer.quantum_efficiency == pytest.approx(
+            efficiency.flat[[0, 1, 64, 65][k]], rel=0.1
+        )
+        assert each.bright.shape == (24, 32)
+
+
+def test_an_irradiance_gives_the_photons_of_the_standard(camera, tmp_path):
+    """Photons are 50.34 A t λ E, of µm², ms, µm and µW/cm²."""
+    text = camera.read_text()
+    for name in ("frames", "dark"):
+        text = text.replace(f'{name} = "', f'{name} = "{camera.parent}/')
+    _, _, photons, times = camera_levels(1)
+    for level, time in zip(photons.tolist(), times.tolist(), strict=True):
+        irradiance = level / (50.34 * 5.5**2 * 1e3 * time * 0.53)
+        text = text.replace(f"photons = {level!r}", f"irradiance_uw_cm2 = {irradiance!r}")
+    path = tmp_path / "camera.toml"
+    path.write_text("[light]\nwavelength_nm = 530\npixel_um = 5.5\n" + text)
+    np.testing.assert_allclose(figures(path).photons, photons, rtol=2e-4)
+
+
+def test_findings_name_what_limits_the_figures(tmp_path):
+    path = written_camera(
+        tmp_path,
+        6,
+        spatial=0,
+        read=0.0,
+        current=0.0,
+        well=1e6,
+        efficiency=0.007 * np.ones((48, 64)),
+        gain=0.25,
+    )
+    with pytest.warns(errors.InputWarning) as said:
+        found = figures(path)
+    assert [each.kind for each in found.findings] == ["saturation", "quantisation"]
+    assert len(said) == 2
+
+
+def test_photons_in_another_unit_are_named(camera, tmp_path):
+    text = camera.read_text().replace('= "', f'= "{camera.parent}/')
+    text = text.replace(f'"{camera.parent}/RGGB', '"RGGB')
+    path = tmp_path / "camera.toml"
+    _, _, photons, _ = camera_levels(1)
+    for level in photons.tolist():
+        text = text.replace(f"photons = {level!r}", f"photons = {level / 100!r}")
+    path.write_text(text)
+    with pytest.warns(errors.InputWarning, match=r"quantum efficiency is \d+.* \(limit 1\.1\)"):
+        found = figures(path)
+    assert np.isnan(found.transfer.quantum_efficiency)
+
+
+def test_memory_does_not_grow_with_frames_and_levels(tmp_path):
+    peaks = []
+    for k, options in enumerate(({"count": 8}, {"count": 24, "frames": 6, "spatial": 48})):
+        folder = tmp_path / str(k)
+        folder.mkdir()
+        loaded = CameraExperiment.load(written_camera(folder, 7, shape=(120, 160), **options))
+        tracemalloc.start()
+        loaded.figures(workers=1)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    # Less than one image of float64 more.
+    assert peaks[1] < peaks[0] + 120 * 160 * 8
+
+
+class TestDescriptor:
+    """EMVA1288_Data.txt, line by line."""
+
+    @pytest.fixture
+    def folder(self, tmp_path):
+        on, off, photons, times = camera_levels(8, count=6)
+        lines = ["# a comment", "v 3.0", "n 12 64 48"]
+        for kind, stacks in (("b", on), ("d", off)):
+            for k, stack in enumerate(stacks):
+                values = [times[k] * 1e9, photons[k]] if kind == "b" else [times[k] * 1e9]
+                lines.append(" ".join([kind, *(f"{each:.0f}" for each in values)]))
+                for j, frame in enumerate(stack):
+                    name = f"images/{kind}_{k}_{j}.tif"
+                    (tmp_path / "images").mkdir(exist_ok=True)
+                    write_frames(tmp_path / name, frame[None], nbytes=frame.nbytes)
+                    lines.append(f"i {name}".replace("/", "\\"))
+        (tmp_path / "EMVA1288_Data.txt").write_text("\n".join(lines) + "\n")
+        return tmp_path
+
+    def test_it_gives_levels_and_their_darks(self, folder):
+        loaded = CameraExperiment.load(folder)
+        assert loaded.path == folder / "EMVA1288_Data.txt"
+        assert loaded.manifest.sensor.bit_depth == 12
+        first = loaded.manifest.exposure[0]
+        assert (first.name, first.dark) == ("line 4", ["images/d_0_0.tif", "images/d_0_1.tif"])
+        found = loaded.figures()[""]
+        assert found.spatial is None
+        assert found.transfer.gain_dn_per_e == pytest.approx(0.25, rel=0.2)
+
+    @pytest.mark.parametrize(
+        ("before", "after", "words"),
+        [
+            ("b_0_1.tif", "b_0_9.tif", r"line 6: 'images/b_0_9\.tif' does not exist"),
+            ("\nd 466", "\nd 467", r"line 4: there are no dark images of 466667 ns"),
+            ("b 466667 467", "b 466667", "line 4: holds 'b 466667', expected 'b' with .*photons"),
+            ("b 466667 467", "b 466667 x", "line 4: holds 'b 466667 x', expected 'b' with"),
+            ("b 466667 467", "b 466667 -3", r"'photons' in exposure 0 \('line 4'\) holds -3"),
+            ("n 12 64 48", "n 12", "line 3: holds 'n 12', expected 'n' with bits"),
+            ("v 3.0", "x 3.0", "line 2: holds 'x 3.0', expected a line of"),
+            ("i images\\b_0_1.tif\n", "", "line 4: names 1 images, expected two or more"),
+            ("b_0_1.tif", "b_0_0.tif", r"'b_0_0.tif' stands twice in 'frames' of .* 'line 4'"),
+            (
+                "b_0_1.tif",
+                "b_1_1.tif",
+                r"stands in 'frames' of exposure 'line 4' and in .* 'line 7'",
+            ),
+            ("n 12", "n 8", r"'b_1_0.tif' of .*'line 7' holds means up to .* 'bit_depth' = 8"),
+        ],
+    )
+    def test_mistakes_are_named_with_their_line(self, folder, before, after, words):
+        path = folder / "EMVA1288_Data.txt"
+        text = path.read_text()
+        assert before in text
+        path.write_text(text.replace(before, after, 1))
+        with pytest.raises(errors.FileError, match=words) as caught:
+            CameraExperiment.load(folder).figures()
+        assert str(caught.value).startswith(str(path))
+
+    def test_an_image_of_another_shape_is_named(self, folder, run):
+        write_frames(folder / "images/b_2_1.tif", np.ones((1, 9, 9), np.uint16), nbytes=162)
+        status, _, told = run("emva", folder)
+        assert status == 1
+        assert "EMVA1288_Data.txt, 'frames' of exposure 'line 10': " in told
+        assert "images/b_2_1.tif: holds uint16 frames of shape (9, 9), expected" in told
+
+    def test_a_folder_without_a_description_is_named(self, tmp_path, run):
+        (tmp_path / "empty").mkdir()
+        status, _, told = run("emva", tmp_path / "empty")
+        assert status == 1
+        assert "holds neither EMVA1288_Data.txt and camera.toml, expected one" in told
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        ("photons = 466.6666666666667\n", "", "give either 'photons' or .* in exposure 0"),
+        ('dark = "d0.tif"\n', "", "key 'dark' is missing in exposure 0"),
+        ("photons = 466.6666666666667\n", "irradiance_uw_cm2 = 3.0\n", r"needs a table \[light\]"),
+        ('"b0.tif"', '"none.tif"', "none.tif: does not exist"),
+        ('"d0.tif"', '"b0.tif"', "'b0.tif' stands in 'frames' of .* and in 'dark'"),
+        (
+            "bit_depth = 12",
+            "saturation = 4000.0",
+            r"'saturation' in \[sensor\] is not for a camera",
+        ),
+        ("exposure_s = ", "exposure_s = -", "'exposure_s' in exposure 0 holds -0.0"),
+    ],
+)
+def test_mistakes_in_a_camera_toml_are_named(camera, before, after, words):
+    text = camera.read_text()
+    assert before in text
+    path = camera.parent / "wrong.toml"
+    path.write_text(text.replace(before, after, 1))
+    with pytest.raises(errors.FileError, match=words) as caught:
+        CameraExperiment.load(path)
+    assert str(caught.value).startswith(str(path))
+
+
+def test_a_level_of_one_frame_is_named(camera, tmp_path):
+    one = read_frames(camera.parent / "b3.tif")[:1]
+    write_frames(tmp_path / "one.tif", one, nbytes=one.nbytes)
+    path = camera.parent / "one.toml"
+    path.write_text(camera.read_text().replace('"b3.tif"', f'"{tmp_path}/one.tif"'))
+    with pytest.raises(
+        errors.FileError, match=r"one.toml, 'frames' of exposure '3': 'frames' has 1"
+    ):
+        CameraExperiment.load(path).figures()
+
+
+def test_one_dark_may_serve_several_levels(camera):
+    path = camera.parent / "same.toml"
+    text = camera.read_text()
+    for k in range(1, 14):
+        text = text.replace(f'"d{k}.tif"', '"d0.tif"')
+    path.write_text(text)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert figures(path).transfer.gain_dn_per_e == pytest.approx(0.25, rel=0.1)
+
+
+def test_averages_stand_for_their_frames(camera):
+    path = camera.parent / "averaged.toml"
+    equipix.average(camera.parent / "b5.tif", saturation=4095).save(camera.parent / "b5.npz")
+    path.write_text(camera.read_text().replace('"b5.tif"', '"b5.npz"'))
+    assert figures(path).transfer == figures(camera).transfer
