@@ -102,6 +102,8 @@ def test_a_wrong_layout_is_named_with_what_the_file_holds(tmp_path, layout, word
 
 def test_a_missing_file_and_an_empty_one_are_named(tmp_path):
     (tmp_path / "a.raw").touch()
+    with pytest.raises(FileError, match=r"name the layout, as in a\.raw:480x640:Mono16"):
+        equipix.average(tmp_path / "a.raw")
     for name, words in (("a", "holds 0 bytes"), ("b", "b.raw:7x9:Mono8: does not exist")):
         with pytest.raises(FileError, match=words):
             equipix.average(tmp_path / f"{name}.raw:7x9:Mono8")

@@ -113,7 +113,7 @@ def frame_format(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any]]:
     """
     if not is_image(path):
         return header(path)[:2]
-    check_planes(path)
+    check_image(path)
     try:
         count, rows, cols, bits = _native.file_format(path)
     except UnsupportedFileError:
@@ -121,8 +121,13 @@ def frame_format(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any]]:
     return (count, rows, cols), np.dtype(f"uint{bits}")
 
 
-def check_planes(path: Path) -> None:
-    """Refuse an OME-TIFF, by its name, whose pages are not frames of one thing."""
+def check_image(path: Path) -> None:
+    """Refuse a file of unknown format, and an OME-TIFF whose pages are not frames of one thing."""
+    if not has_format(path):
+        raise FileError(
+            f"{path}: has no suffix of an image, expected {', '.join(_IMAGES)}; of bare bytes name "
+            f"the layout, as in {path.name}:480x640:Mono16"
+        )
     if path.name.lower().endswith((".ome.tif", ".ome.tiff")):
         tiff.header(path)
 
@@ -169,7 +174,7 @@ def _frames(path: Path, workers: int | None) -> Iterator[NDArray[Any]]:
         with reading(path):
             yield from _reader(path).stream_frames(path)
         return
-    check_planes(path)
+    check_image(path)
     with suppress(UnsupportedFileError):
         count, rows, cols, bits = _native.file_format(path)
         if count == 1 or count * rows * cols * bits <= 8 * _AT_ONCE:
