@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import tifffile
 
 import equipix
 from equipix import simulate
@@ -119,4 +120,30 @@ def written_camera(folder, rng=1, *, spatial=16, cfa=None, **options):
         lines += ["[spatial]", 'frames = "b.tif"', 'dark = "d.tif"']
     path = folder / "camera.toml"
     path.write_text("\n".join(lines))
+    return path
+
+
+def write_dng(path, counts, *, pattern="RGGB", black=64, white=4095, exposure=(1, 50), area=None):
+    """Write counts behind Bayer's filters as a DNG, as the specification 1.4 has its tags."""
+    repeat, levels = ((2, 2), black) if isinstance(black, tuple) else ((1, 1), (black,))
+    tags = [
+        (50706, "B", 4, (1, 4, 0, 0)),  # DNGVersion
+        (50708, "s", 0, "equipix"),  # UniqueCameraModel
+        (33421, "H", 2, (2, 2)),  # CFARepeatPatternDim
+        (33422, "B", 4, bytes("RGB".index(each) for each in pattern)),  # CFAPattern
+        (50713, "H", 2, repeat),  # BlackLevelRepeatDim
+        (50714, "H", len(levels), levels),  # BlackLevel
+        (50717, "I", 1, white),  # WhiteLevel
+        (50721, "2i", 9, (1, 1, 0, 1, 0, 1, 0, 1, 1, 1, 0, 1, 0, 1, 0, 1, 1, 1)),  # ColorMatrix1
+    ]
+    tags += [(33434, "2I", 1, exposure)] if exposure else []  # ExposureTime
+    tags += [(50829, "I", 4, area)] if area else []  # ActiveArea: top, left, bottom, right
+    tifffile.imwrite(
+        path,
+        counts,
+        photometric=32803,
+        metadata=None,
+        subfiletype=0,
+        extratags=[(*each, True) for each in tags],
+    )
     return path

@@ -96,8 +96,12 @@ def test_the_commands_of_readme_and_pages_run(tmp_path):
 
 
 def test_the_manifests_of_the_pages_are_valid():
-    text, region = blocks("toml", "docs/experiment.md")
-    assert len(Manifest.model_validate(tomllib.loads(text)).exposure) == 3
+    text, region, darks, layout = blocks("toml", "docs/experiment.md")
+    known = tomllib.loads(text)
+    assert len(Manifest.model_validate(known).exposure) == 3
+    several = Manifest.model_validate(known | tomllib.loads(darks) | tomllib.loads(layout))
+    assert [each.exposure_s for each in several.dark] == [1, 4]
+    assert several.layout.pixel == "Mono12p"
     assert len(Sensor.model_validate(tomllib.loads(region)["sensor"]).region) == 1
     (levels,) = blocks("toml", "docs/nuc.md")
     assert len(LevelManifest.model_validate(tomllib.loads(levels)).level) == 1

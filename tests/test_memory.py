@@ -342,3 +342,22 @@ def test_files_are_corrected_in_constant_memory(tmp_path):
     said = run(CORRECT, tmp_path / "correction.tif", *source, "-o", output)
     assert said.returncode == 0, said.stderr
     assert frame_format(output)[0] == (800, *shape)
+
+
+@pytest.mark.parametrize("layout", ["Mono12p", "Mono16"])
+def test_bare_frames_are_averaged_in_constant_memory(tmp_path, layout):
+    """One frame is unpacked at a time: 60 MB of packed frames of 300 kB take less than 10 MB."""
+    packed = np.random.default_rng(1).integers(0, 15, 300_000, dtype=np.uint8).tobytes()
+    with (tmp_path / "a.raw").open("wb") as file:
+        for _ in range(200):
+            file.write(packed)
+    shape = "400x500" if layout == "Mono12p" else "300x500"
+    tracemalloc.start()
+    try:
+        found = equipix.average(f"{tmp_path}/a.raw:{shape}:{layout}", saturation=4095)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert found.count.max() == 200
+    # Sixteen frames of 16 bits in a batch, and the six maps of the result.
+    assert peak < (16 * 2 + 6 * 8 + 8) * found.mean.size

@@ -155,7 +155,7 @@ def test_inspect_names_the_file(tmp_path, capsys):
     )
     assert "'path'" not in said
     with pytest.raises(errors.InputError, match="ends in"):
-        equipix.load(tmp_path / "mean.fits")
+        equipix.load(tmp_path / "mean.jpg")
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".xyz", ".TOML"])

@@ -1,6 +1,7 @@
 """Moves of the sensor, measured from images of a small aperture in the beam."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
@@ -16,7 +17,6 @@ from equipix.findings import usable
 from equipix.fitting.weighted import Weighted
 from equipix.measured.colour import Filters
 from equipix.measured.saturation import saturation_level
-from equipix.measured.statistics import FrameStatistics
 
 _AROUND = 8
 """Pixels to each side of a spot's middle that represent those under it."""
@@ -40,17 +40,27 @@ class Equalisation:
         Relative variance of the sensitivity by noise, the beam being known: 1/(M² Σ w c²L²), times
         n/(n − 2) since a pixel's n measurements determine the beam too; with two, which determine
         no noise, times 2. NaN where unknown.
+    darks : sequence of ndarray
+        The dark of each exposure, where they are known.
     """
 
     gain: Array
     dark: Array
     variance: Array
+    darks: Sequence[Array] = ()
 
     @classmethod
-    def of(cls, weighted: Weighted, flags: Array, workers: int | None = None) -> Self:
-        """Take it from the fit of exposures whose dark is known."""
+    def of(
+        cls,
+        weighted: Weighted,
+        flags: Array,
+        workers: int | None = None,
+        darks: Sequence[Array] = (),
+    ) -> Self:
+        """Take it from the fit of exposures whose dark is known, or their darks are given."""
         exposures, fit = weighted.exposures, weighted.fit
-        if exposures.dark is None:
+        dark = next(iter(darks), None) if exposures.dark is None else exposures.dark
+        if dark is None:
             raise InputError(
                 "'calibration' holds no dark frame: give one that Experiment.run has made"
             )
@@ -61,15 +71,21 @@ class Equalisation:
             variance = weighted.noise_variance * count / max(count - 2, 1) / known
         gain = np.where(good, fit.sensitivity, 1) * exposures.response
         gain = gain.astype(exposures.values.dtype)
-        return cls(gain, exposures.dark, np.where(good, variance, np.nan))
+        return cls(gain, dark, np.where(good, variance, np.nan), darks)
 
     @classmethod
-    def of_colours(cls, filters: Filters | None, dark: FrameStatistics) -> Self | None:
+    def of_colours(cls, filters: Filters | None, darks: Sequence[Array]) -> Self | None:
         """Responses of the colours alone, before any fit; None of a sensor without filters."""
         if filters is None:
             return None
-        gain = filters.map_of(dark.mean.shape)
-        return cls(gain, dark.mean, np.full(gain.shape, np.nan))
+        gain = filters.map_of(darks[0].shape)
+        return cls(gain, darks[0], np.full(gain.shape, np.nan), darks)
+
+    def at(self, exposure: int) -> Self:
+        """Return it for images with the dark of an exposure."""
+        if not self.darks:
+            return self
+        return replace(self, dark=self.darks[exposure].astype(self.gain.dtype))
 
     def apply(self, frames: Array) -> Array:
         """Images of the aperture as equal pixels would have given them."""
@@ -105,10 +121,11 @@ def measured_shifts(
     """
     first, *others = manifest.exposure
     shifts, variances = ([each] for each in _given(first))
-    for old, new in zip(manifest.exposure, others, strict=False):
+    for number, (old, new) in enumerate(zip(manifest.exposure, others, strict=False), start=1):
         shift, variance = _given(new)
         if new.shift is None:
-            spots, shape = _spots(path, manifest, new, equalisation, hot)
+            equal = None if equalisation is None else equalisation.at(number)
+            spots, shape = _spots(path, manifest, new, equal, hot)
             ends = ((spots.before, old.rotation), (spots.after, new.rotation))
             before, after = (in_beam(spot.position, turn, shape) for spot, turn in ends)
             shift = shifts[-1] + before - after
@@ -137,7 +154,7 @@ def _spots(
 ) -> tuple[ShiftMeasurement, tuple[int, int]]:
     """Find the spots of the move to `exposure`, and the shape of the sensor."""
     before, after = (
-        raw_frames(entry_files(path, entry))
+        raw_frames(entry_files(path, entry, manifest.layout))
         for entry in (exposure.aperture_before, exposure.aperture_after)
         if entry is not None
     )

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Self, TypeVar
@@ -10,15 +10,33 @@ from typing import Any, ClassVar, Generic, Self, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from equipix._check import EXPOSURES, Bools, Progress, Words, as_mask, naming_memory, staged, union
+from equipix._check import (
+    EXPOSURES,
+    Array,
+    Bools,
+    Progress,
+    Words,
+    as_mask,
+    naming_memory,
+    staged,
+    union,
+)
 from equipix.errors import FileError, InputError
-from equipix.experiment.image_files import check_formats, image_files, refuse_repeats, sha256_of
+from equipix.experiment.darks import Darks, chosen
+from equipix.experiment.image_files import (
+    black_level,
+    check_formats,
+    completed,
+    image_files,
+    refuse_repeats,
+    sha256_of,
+)
 from equipix.experiment.manifest import (
     CameraManifest,
-    Dark,
     LevelManifest,
     Manifest,
     entry_files,
+    name_of_dark,
     read_manifest,
 )
 from equipix.io.formats import read_mask
@@ -75,7 +93,7 @@ class Described(Generic[_Manifest]):
         described = cls(file, cls._read(file))
         described.files()
         refuse_repeats(file, described.manifest)
-        return described
+        return replace(described, manifest=completed(file, described.manifest))
 
     @classmethod
     def _read(cls, file: Path) -> Any:
@@ -85,20 +103,24 @@ class Described(Generic[_Manifest]):
     def files(self) -> list[Path]:
         """All image files, each once."""
         mask = self.manifest.sensor.mask
-        masks: list[Path] = [] if mask is None else entry_files(self.path, mask)
+        masks: list[Path] = [] if mask is None else self._entry(mask)
         return list(dict.fromkeys([*image_files(self.path, self.manifest), *masks]))
+
+    def _entry(self, entry: str | list[str]) -> list[Path]:
+        """Files of an entry."""
+        return entry_files(self.path, entry, self.manifest.layout)
 
     def _statistics(
         self,
         name: str,
         entry: str | list[str],
-        dark: FrameStatistics | None,
+        dark: FrameStatistics | Array | None,
         workers: int | None,
         progress: Progress | None,
         mask: Bools | None = None,
     ) -> FrameStatistics:
         """Average the files of an entry; `name` is for the progress."""
-        sensor, files = self.manifest.sensor, entry_files(self.path, entry)
+        sensor, files = self.manifest.sensor, self._entry(entry)
         level = sensor.saturation_level
         stage = staged(progress, f"averaging {name}")
         found = average(
@@ -113,19 +135,27 @@ class Described(Generic[_Manifest]):
         return found
 
     @naming_memory("averaging")
-    def _dark(
-        self, entry: Dark, workers: int | None = None, progress: Progress | None = None
-    ) -> FrameStatistics:
-        """Average the dark frames."""
-        dark = self._statistics("dark", entry.frames, None, workers, progress)
-        files = ", ".join(map(str, entry_files(self.path, entry.frames)))
-        refuse_subtracted(dark, f"{self.path}: [dark] {files}")
-        return dark
+    def _darks(self, workers: int | None = None, progress: Progress | None = None) -> Darks:
+        """Average the dark frames that are used; in a camera.toml they stand with exposures."""
+        assert not isinstance(self.manifest, CameraManifest)
+        shares, entries = chosen(self.path, self.manifest), self.manifest.dark or []
+        if not entries:
+            needed = isinstance(self.manifest, Manifest)
+            return Darks((), shares, black_level(self.files()[0]) if needed else None)
+        used = [k for k in range(len(entries)) if any(each[k] for each in shares)]
+        frames = []
+        for k in used:
+            name = "dark" if len(entries) == 1 else f"dark {k + 1}"
+            dark = self._statistics(name, entries[k].frames, None, workers, progress)
+            files = ", ".join(map(str, self._entry(entries[k].frames)))
+            refuse_subtracted(dark, f"{self.path}: {name_of_dark(k, len(entries))} {files}")
+            frames.append(dark)
+        return Darks(tuple(frames), [tuple(each[k] for k in used) for each in shares])
 
     @naming_memory("averaging")
     def _average(
         self,
-        dark: FrameStatistics | None,
+        darks: Darks,
         workers: int | None = None,
         progress: Progress | None = None,
     ) -> Averaged:
@@ -139,11 +169,13 @@ class Described(Generic[_Manifest]):
             saturation_key=sensor.saturation_key,
             words=self._words,
             colours=Colours.of(sensor.cfa),
+            darks=darks.frames,
+            black=darks.black,
         )
-        for name, frames in measurements:
-            statistics = self._statistics(name, frames, dark, workers, progress)
+        for k, (name, taken) in enumerate(measurements):
+            statistics = self._statistics(name, taken.frames, darks.of(k), workers, progress)
             try:
-                averaged.add(statistics, name)
+                averaged.add(statistics, name, darks.shares[k] if darks.frames else None)
             except InputError as error:
                 raise FileError(f"{self.path}: {error}") from error
         return averaged
@@ -168,7 +200,9 @@ class Described(Generic[_Manifest]):
     def _excluded(self, shape: tuple[int, int]) -> Bools | None:
         """Pixels that ``[sensor]`` excludes; None without a mask and regions."""
         sensor = self.manifest.sensor
-        masks = [] if sensor.mask is None else [_of_file(self.path, sensor.mask, shape)]
+        masks = []
+        if sensor.mask is not None:
+            masks.append(_of_file(self._entry(sensor.mask)[0], shape))
         for index, region in enumerate(sensor.region or [], start=1):
             masks.append(region.pixels(f"{self.path}: [[sensor.region]] {index}", shape))
         excluded = union(*masks)
@@ -190,8 +224,7 @@ class Described(Generic[_Manifest]):
         }
 
 
-def _of_file(path: Path, entry: str, shape: tuple[int, int]) -> Bools:
-    file = entry_files(path, entry)[0]
+def _of_file(file: Path, shape: tuple[int, int]) -> Bools:
     mask = read_mask(file)
     if mask.shape != shape:
         raise FileError(

@@ -17,7 +17,6 @@ from equipix.exposures.positions import Positions
 from equipix.findings import Finding, say
 from equipix.fitting.pixels import pixel_flags
 from equipix.fitting.weighted import Options, weighted_fit
-from equipix.measured.defects import hot_pixels
 from equipix.measured.measured import measured_of
 
 _ROUGH = 1e-4
@@ -84,21 +83,21 @@ class Experiment(Described[Manifest]):
         its image at p_before and p_after, d_new = d_old + (A_old p_before + t_old) −
         (A_new p_after + t_new).
         """
-        equalisation = None
-        if calibration is not None:
-            if calibration.weighted is None:
-                raise InputError(
-                    "'calibration' was read from a file, which does not hold the measurements: "
-                    "give the result of Experiment.run"
-                )
-            equalisation = Equalisation.of(calibration.weighted, calibration.flags)
-        hot = None
-        if self._is_moved():
-            dark = self._dark(self.manifest.dark)
-            hot = hot_pixels(dark, None)
-            if calibration is None and self.manifest.sensor.cfa is not None:
-                equalisation = Equalisation.of_colours(self._average(dark).filters, dark)
-        return measured_shifts(self.path, self.manifest, equalisation, hot=hot)
+        if calibration is not None and calibration.weighted is None:
+            raise InputError(
+                "'calibration' was read from a file, which does not hold the measurements: "
+                "give the result of Experiment.run"
+            )
+        if not self._is_moved():
+            return measured_shifts(self.path, self.manifest)
+        darks, equalisation = self._darks(), None
+        if calibration is not None and calibration.weighted is not None:
+            equalisation = Equalisation.of(
+                calibration.weighted, calibration.flags, darks=darks.means
+            )
+        elif self.manifest.sensor.cfa is not None:
+            equalisation = Equalisation.of_colours(self._average(darks).filters, darks.means)
+        return measured_shifts(self.path, self.manifest, equalisation, hot=darks.hot)
 
     def _is_moved(self) -> bool:
         """Whether a move is measured from images of the aperture."""
@@ -177,10 +176,10 @@ class Experiment(Described[Manifest]):
                 "[[exposure]]"
             )
         excluded, hashes = self._checked(mask)
-        dark = self._dark(self.manifest.dark, workers, progress)
-        hot = hot_pixels(dark, None)
-        averaged = self._average(dark, workers, progress)
-        colours = Equalisation.of_colours(averaged.filters, dark)
+        darks = self._darks(workers, progress)
+        hot = darks.hot
+        averaged = self._average(darks, workers, progress)
+        colours = Equalisation.of_colours(averaged.filters, darks.means)
         shifts, std = measured_shifts(self.path, self.manifest, colours, hot=hot)
         whole = fit_options.whole_shifts
         with naming_memory("calibrating"):
@@ -204,7 +203,8 @@ class Experiment(Described[Manifest]):
         elif self._is_moved():
             rough = replace(fit_options, tolerance=max(tolerance, _ROUGH))
             first = weighted_fit(exposures, replace(options, fit=rough))
-            equalisation = Equalisation.of(first, pixel_flags(first, rough), workers)
+            flags = pixel_flags(first, rough)
+            equalisation = Equalisation.of(first, flags, workers, darks=darks.means)
             shifts, std = measured_shifts(self.path, self.manifest, equalisation, hot=hot)
             exposures = exposures.at(Positions.of(shifts, rotation=positions.rotation, std=std))
             start = first.fit

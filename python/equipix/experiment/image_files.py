@@ -4,16 +4,26 @@ import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from equipix._check import Array
 from equipix.errors import FileError
-from equipix.experiment.manifest import AnyManifest, CameraManifest, LevelManifest, entry_files
+from equipix.experiment.manifest import (
+    AnyManifest,
+    CameraManifest,
+    LevelManifest,
+    Manifest,
+    entry_files,
+    name_of_dark,
+)
+from equipix.io import binary, camera_raw
 from equipix.io.arrays import split
 from equipix.io.formats import refuse_saved
 from equipix.io.frames import frame_format, read_frames
+from equipix.io.paths import reading
+from equipix.measured.colour import Colours
 from equipix.measured.statistics import saved_shape
 
 
@@ -47,6 +57,56 @@ def _format(file: Path) -> tuple[tuple[int, int], np.dtype[Any] | None]:
     return (rows, cols), dtype
 
 
+_Manifest = TypeVar("_Manifest", Manifest, LevelManifest, CameraManifest)
+
+
+def completed(path: Path, manifest: _Manifest) -> _Manifest:
+    """Take what a manifest leaves out from its layout, and from raw files of cameras.
+
+    Raises
+    ------
+    FileError
+        If these contradict it or one another, or there is neither a dark nor a black level.
+    """
+    sensor, files = manifest.sensor, image_files(path, manifest)
+    told = {file: _told(file) for file in files if file.suffix.lower() in camera_raw.SUFFIXES}
+    needs_black = isinstance(manifest, Manifest) and manifest.dark is None
+    if needs_black and len(told) < len(files):
+        raise FileError(f"{path}: key 'dark' is missing")
+    own: dict[str, object] = {}
+    if sensor.saturation_level is None and manifest.layout is not None:
+        own["bit_depth"] = binary.FORMATS[manifest.layout.pixel]
+    elif sensor.saturation_level is None and told:
+        own["saturation"] = float(min(each.white for each in told.values()))
+    given, whence = Colours.of(sensor.cfa), "'cfa' in [sensor]"
+    for file, each in told.items():
+        found = Colours.of(each.cfa)
+        if given is None and found is not None:
+            given, whence, own["cfa"] = found, f"'{file.name}'", str(found)
+        if given is not None and found is not None and not found.agrees(given):
+            raise FileError(
+                f"{path}: {whence} holds the colours '{given}', but '{file.name}' '{found}': "
+                "correct 'cfa' in [sensor], or name the files of one sensor"
+            )
+        if needs_black and each.black != told[files[0]].black:
+            raise FileError(
+                f"{path}: the black levels of '{files[0].name}' and '{file.name}' differ: give "
+                "[dark] with dark frames"
+            )
+    return manifest.model_copy(update={"sensor": sensor.model_copy(update=own)})
+
+
+def black_level(file: Path) -> Array:
+    """Black level of each pixel, in DN, that a raw file holds."""
+    _, rows, cols = frame_format(file)[0]
+    return _told(file).dark((rows, cols))
+
+
+def _told(file: Path) -> camera_raw.Told:
+    with reading(file):
+        return camera_raw.told(file)
+
+
 class Entry(NamedTuple):
     """The files of one key of experiment.toml."""
 
@@ -57,7 +117,7 @@ class Entry(NamedTuple):
 
     def __str__(self) -> str:
         """Return the words for a message."""
-        return f"'{self.key}' of {self.kind} '{self.exposure}'" if self.exposure else "[dark]"
+        return f"'{self.key}' of {self.kind} '{self.exposure}'" if self.exposure else self.kind
 
 
 def refuse_repeats(
@@ -83,7 +143,9 @@ def refuse_repeats(
     for first, second in combinations(entries, 2):
         images = "aperture" in first.key and "aperture" in second.key
         darks = first.key == second.key == "dark"
-        if darks or (images and first.exposure != second.exposure):
+        if images and first.exposure != second.exposure:
+            continue
+        if darks and (hashes or isinstance(manifest, CameraManifest)):
             continue
         for one, other in _alike(first.files, second.files, marks):
             raise FileError(
@@ -119,23 +181,26 @@ def image_files(path: Path, manifest: AnyManifest) -> list[Path]:
 
 def entries_of(path: Path, manifest: AnyManifest) -> Iterator[Entry]:
     """Give the keys that name files of measurements, with the files."""
+    layout = manifest.layout
     if isinstance(manifest, CameraManifest):
         for name, each in manifest.series:
             kind = "table" if each is manifest.spatial else "exposure"
-            yield Entry("frames", name, entry_files(path, each.frames), kind)
-            yield Entry("dark", name, entry_files(path, each.dark), kind)
+            yield Entry("frames", name, entry_files(path, each.frames, layout), kind)
+            yield Entry("dark", name, entry_files(path, each.dark, layout), kind)
         return
-    if manifest.dark is not None:
-        yield Entry("dark", "", entry_files(path, manifest.dark.frames))
+    darks = manifest.dark or []
+    for index, dark in enumerate(darks):
+        called = name_of_dark(index, len(darks))
+        yield Entry("dark", "", entry_files(path, dark.frames, layout), called)
     if isinstance(manifest, LevelManifest):
         for name, level in zip(manifest.names, manifest.level, strict=True):
-            yield Entry("frames", name, entry_files(path, level.frames), "level")
+            yield Entry("frames", name, entry_files(path, level.frames, layout), "level")
         return
     for exposure in manifest.exposure:
         for key in ("frames", "aperture_before", "aperture_after"):
             entry = getattr(exposure, key)
             if entry is not None:
-                yield Entry(key, exposure.name, entry_files(path, entry))
+                yield Entry(key, exposure.name, entry_files(path, entry, layout))
 
 
 def _resolved(files: Iterable[Path]) -> dict[Path, Path]:

@@ -90,9 +90,8 @@ class LevelExperiment(Described[LevelManifest]):
         """
         check_order(order, by)
         excluded, hashes = self._checked(mask)
-        entry = self.manifest.dark
-        dark = None if entry is None else self._dark(entry, workers, progress)
-        averaged = self._average(dark, workers, progress).counted_from_lowest()
+        darks = self._darks(workers, progress)
+        averaged = self._average(darks, workers, progress).counted_from_lowest()
         levels = levels_of(averaged, mask=excluded)
         if words := self._falling(levels):
             said = say(Finding("light", words, "misfit"))

@@ -6,10 +6,13 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+from pydantic.functional_validators import BeforeValidator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from equipix._check import Bools
 from equipix.errors import EquipixError, FileError, InputError
+from equipix.io import binary
+from equipix.io.frames import Settings, has_format
 from equipix.io.paths import find_files
 from equipix.measured.colour import Colours
 
@@ -27,7 +30,16 @@ _WANTED = {
     "centre": "[row, col] in pixels",
     "radius": "a positive number of pixels",
     "outside": "true or false",
-    "dark": "a table, or files in a camera.toml",
+    "dark": "a table [dark], or tables [[dark]]; files in a camera.toml",
+    "dark_temperature_tolerance_c": "a number of kelvins, not negative",
+    "layout": "a table",
+    "shape": "[rows, cols], two whole numbers above 0",
+    "pixel": f"one of {', '.join(binary.FORMATS)}",
+    "big_endian": "true or false",
+    "skip_bytes": "a whole number, not negative",
+    "gap_bytes": "a whole number, not negative",
+    "exposure_s": "a number of seconds, not negative",
+    "temperature_c": "a number of degrees Celsius",
     "exposure": "two or more tables [[exposure]]",
     "level": "one or more tables [[level]]",
     "value": "a number",
@@ -42,7 +54,6 @@ _WANTED = {
     "flux_std": "a positive number, relative to the flux",
     "time": "a number of seconds",
     "rotation": "0, 90, 180 or 270",
-    "exposure_s": "a number of seconds, not negative",
     "photons": "a number of photons per pixel, not negative",
     "irradiance_uw_cm2": "a number of µW/cm², not negative",
     "light": "a table",
@@ -127,6 +138,23 @@ class Region(Table):
         return inside
 
 
+class Layout(Table):
+    """Table ``[layout]``: how the bytes of files without a format of their own are frames."""
+
+    shape: Annotated[list[Annotated[int, Field(gt=0)]], Field(min_length=2, max_length=2)]
+    pixel: Literal["Mono8", "Mono10", "Mono10p", "Mono12", "Mono12p", "Mono14", "Mono16"]
+    big_endian: bool = False
+    skip_bytes: Annotated[int, Field(ge=0)] = 0
+    gap_bytes: Annotated[int, Field(ge=0)] = 0
+
+    def behind(self, file: Path) -> Path:
+        """Return a file with its layout behind its name, unless it has a format of its own."""
+        if has_format(file) or binary.split(str(file))[1]:
+            return file
+        (rows, cols), between = self.shape, (self.skip_bytes, self.gap_bytes, self.big_endian)
+        return Path(f"{file}:{binary.Layout(rows, cols, self.pixel, *between)}")
+
+
 class Sensor(Table):
     """Table ``[sensor]``: levels in DN, and pixels that must not be used."""
 
@@ -135,6 +163,8 @@ class Sensor(Table):
     saturation: Positive | None = None
     gain_dn_per_e: Positive | None = None
     cfa: Text | list[Text] | list[list[Text]] | None = None
+    # A dark current that doubles every 6.5 K changes by 5 % in half a kelvin.
+    dark_temperature_tolerance_c: Annotated[FiniteFloat, Field(ge=0)] = 0.5
     mask: Text | None = None
     region: Annotated[list[Region], Field(min_length=1)] | None = None
 
@@ -175,17 +205,34 @@ class Sensor(Table):
         return "bit_depth" if self.saturation is None and self.bit_depth else "saturation"
 
 
-class Dark(Table):
-    """Table ``[dark]``: frames without light."""
+class Taken(Table):
+    """Frames, with the exposure time and temperature that they were taken with."""
 
     frames: Files
+    exposure_s: Annotated[FiniteFloat, Field(ge=0)] | None = None
+    temperature_c: FiniteFloat | None = None
+
+    @property
+    def settings(self) -> Settings:
+        """Exposure time and temperature, where they are given."""
+        return Settings(self.exposure_s, self.temperature_c)
 
 
-class Exposure(Table):
+class Dark(Taken):
+    """Table ``[dark]``, or one of several ``[[dark]]``: frames without light."""
+
+
+Darks = Annotated[
+    list[Dark],
+    Field(min_length=1),
+    BeforeValidator(lambda given: [given] if isinstance(given, dict) else given),
+]
+
+
+class Exposure(Taken):
     """One ``[[exposure]]``: the frames of one sensor position, and that position."""
 
     name: Text
-    frames: Files
     aperture_before: Files | None = None
     aperture_after: Files | None = None
     shift: Pair | None = None
@@ -208,10 +255,9 @@ class Exposure(Table):
         return self
 
 
-class Level(Table):
+class Level(Taken):
     """One ``[[level]]``: frames of a uniform source, and what the source was set to."""
 
-    frames: Files
     name: str = ""
     value: FiniteFloat | None = None
     unit: Text | None = None
@@ -228,7 +274,8 @@ class LevelManifest(Table):
 
     format: Literal[1] = 1
     sensor: Sensor = Sensor()
-    dark: Dark | None = None
+    layout: Layout | None = None
+    dark: Darks | None = None
     level: Annotated[list[Level], Field(min_length=1)]
 
     @model_validator(mode="after")
@@ -250,9 +297,9 @@ class LevelManifest(Table):
         ]
 
     @property
-    def measurements(self) -> list[tuple[str, str | list[str]]]:
+    def measurements(self) -> list[tuple[str, Taken]]:
         """Name and frames of each level."""
-        return [(name, each.frames) for name, each in zip(self.names, self.level, strict=True)]
+        return list(zip(self.names, self.level, strict=True))
 
 
 class Manifest(Table):
@@ -260,7 +307,8 @@ class Manifest(Table):
 
     format: Literal[1] = 1
     sensor: Sensor = Sensor()
-    dark: Dark
+    layout: Layout | None = None
+    dark: Darks | None = None
     exposure: Annotated[list[Exposure], Field(min_length=2)]
 
     @model_validator(mode="after")
@@ -286,9 +334,9 @@ class Manifest(Table):
         return self
 
     @property
-    def measurements(self) -> list[tuple[str, str | list[str]]]:
+    def measurements(self) -> list[tuple[str, Taken]]:
         """Name and frames of each exposure."""
-        return [(each.name, each.frames) for each in self.exposure]
+        return [(each.name, each) for each in self.exposure]
 
 
 class Series(Table):
@@ -325,6 +373,7 @@ class CameraManifest(Table):
 
     format: Literal[1] = 1
     sensor: Sensor = Sensor()
+    layout: Layout | None = None
     light: CameraLight | None = None
     exposure: Annotated[list[CameraExposure], Field(min_length=2)]
     spatial: Series | None = None
@@ -350,9 +399,9 @@ class CameraManifest(Table):
         return [(each.name or str(k), each) for k, each in enumerate(self.exposure)] + spatial
 
     @property
-    def measurements(self) -> list[tuple[str, str | list[str]]]:
+    def measurements(self) -> list[tuple[str, Series]]:
         """Name and frames of each exposure."""
-        return [(name, each.frames) for name, each in self.series]
+        return self.series
 
 
 AnyManifest = Manifest | LevelManifest | CameraManifest
@@ -380,12 +429,18 @@ def checked_content(path: Path, content: dict[str, Any], model: type[_Content]) 
         raise FileError(f"{path}: {'; '.join(_problems(error.errors(), content))}") from None
 
 
-def entry_files(manifest: Path, entry: str | list[str]) -> list[Path]:
-    """Find the files of an entry of `manifest` (a file, a glob or a list)."""
+def entry_files(path: Path, entry: Files, layout: Layout | None = None) -> list[Path]:
+    """Find the files of an entry of the manifest `path` (a file, a glob or a list)."""
     try:
-        return find_files(entry, folder=manifest.parent)
+        files = find_files(entry, folder=path.parent)
     except EquipixError as error:
-        raise FileError(f"{manifest}: {error}") from error
+        raise FileError(f"{path}: {error}") from error
+    return files if layout is None else list(map(layout.behind, files))
+
+
+def name_of_dark(index: int, count: int) -> str:
+    """Return what messages call a dark."""
+    return "[dark]" if count == 1 else f"[[dark]] {index + 1}"
 
 
 def _problem(text: str) -> PydanticCustomError:
@@ -413,15 +468,7 @@ def _problems(details: list[ErrorDetails], content: dict[str, Any]) -> list[str]
 def _sentence(detail: ErrorDetails, content: dict[str, Any]) -> str:
     """One of pydantic's errors in the terms of the file."""
     location = detail["loc"]
-    match location:
-        case ["exposure" | "level" as kind, int(index), *_]:
-            place = f" in {kind} {index}{_name(content[kind][index])}"
-        case ["sensor", "region", int(index), *_]:
-            place = f" in [[sensor.region]] {index + 1}"
-        case [table, _, *_]:
-            place = f" in [{table}]"
-        case _:
-            place = ""
+    place = _place(location, content)
     if detail["type"] == "manifest":
         return detail["msg"] + place
     if detail["type"] == "extra_forbidden":
@@ -440,6 +487,19 @@ def _sentence(detail: ErrorDetails, content: dict[str, Any]) -> str:
     if key in ("exposure", "level") and isinstance(value, dict):
         return f"[{key}] is one table: write [[{key}]], with two brackets, for each {key}"
     return f"'{key}'{place} holds {value!r}, expected {_WANTED[key]}"
+
+
+def _place(location: tuple[int | str, ...], content: dict[str, Any]) -> str:
+    match location:
+        case ["exposure" | "level" as kind, int(index), *_]:
+            return f" in {kind} {index}{_name(content[kind][index])}"
+        case ["dark", int(index), *_] if isinstance(content["dark"], list):
+            return f" in [[dark]] {index + 1}"
+        case ["sensor", "region", int(index), *_]:
+            return f" in [[sensor.region]] {index + 1}"
+        case [table, _, *_]:
+            return f" in [{table}]"
+    return ""
 
 
 def _name(table: object) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from equipix.errors import EquipixError, FileError
+from equipix.io import binary
 
 _AT_ONCE = 2**26
 """Most bytes that are read at once; at least a frame is."""
@@ -28,13 +29,17 @@ _MOST_LISTED = 8
 
 
 def split(path: Path) -> tuple[Path, str]:
-    """Return the file, and the place of an array in it; empty where none is named."""
+    """Return the file, and what stands behind its name: the place of an array in it, or a layout.
+
+    Empty where nothing does.
+    """
     text = str(path)
     for suffix in (*HDF5, *ZARR):
         head, found, place = text.partition(f"{suffix}:")
         if found:
             return Path(head + suffix), place
-    return path, ""
+    name, layout = binary.split(text)
+    return (Path(name), layout) if layout else (path, "")
 
 
 def header(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any], str]:

@@ -82,6 +82,18 @@ def description(path: Path) -> str:
         return units[_TEXT].data.tobytes().decode() if _TEXT in units else ""
 
 
+def settings(path: Path) -> tuple[float | None, float | None]:
+    """Exposure time in s and temperature in °C, where the headers of a file hold them."""
+    with _astropy().open(path) as units:
+        return _keyword(units, "EXPTIME", "EXPOSURE"), _keyword(units, "CCD-TEMP", "SET-TEMP")
+
+
+def _keyword(units: Any, *names: str) -> float | None:
+    """Value of the first of some keywords that a header holds."""
+    found = (unit.header[name] for name in names for unit in units if name in unit.header)
+    return next((float(value) for value in found if isinstance(value, int | float)), None)
+
+
 def header(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any], str]:
     """Shape (n, rows, cols) and dtype of the frames of a file, none of which is decoded; its text.
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from equipix import _native
 from equipix.errors import FileError, UnsupportedFileError
-from equipix.io import arrays, fits, png, tiff
+from equipix.io import arrays, binary, camera_raw, fits, png, tiff
 from equipix.io.paths import find_files, reading
 
 _AT_ONCE = 2**27
@@ -77,13 +77,25 @@ def stream_frames(
 _READERS = {
     **dict.fromkeys(arrays.SUFFIXES, arrays),
     **dict.fromkeys(fits.SUFFIXES, fits),
+    **dict.fromkeys(camera_raw.SUFFIXES, camera_raw),
 }
 """The module that reads each kind of file besides images: ``header`` and ``stream_frames``."""
+
+_IMAGES = (".tif", ".tiff", ".png", ".pgm", ".bmp")
+
+
+def _reader(path: Path) -> Any:
+    return binary if binary.split(str(path))[1] else _READERS.get(suffix_of(path))
 
 
 def is_image(path: Path) -> bool:
     """Whether a file is an image, which the compiled reader or tifffile decodes."""
-    return suffix_of(path) not in _READERS
+    return _reader(path) is None
+
+
+def has_format(path: Path) -> bool:
+    """Whether a file has a format of its own by its name, so that its layout is not asked for."""
+    return suffix_of(path) in (*_IMAGES, *_READERS, ".npz")
 
 
 def suffix_of(path: Path) -> str:
@@ -101,11 +113,41 @@ def frame_format(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any]]:
     """
     if not is_image(path):
         return header(path)[:2]
+    check_image(path)
     try:
         count, rows, cols, bits = _native.file_format(path)
     except UnsupportedFileError:
         return tiff.header(path)[:2]
     return (count, rows, cols), np.dtype(f"uint{bits}")
+
+
+def check_image(path: Path) -> None:
+    """Refuse a file of unknown format, and an OME-TIFF whose pages are not frames of one thing."""
+    if not has_format(path):
+        raise FileError(
+            f"{path}: has no suffix of an image, expected {', '.join(_IMAGES)}; of bare bytes name "
+            f"the layout, as in {path.name}:480x640:Mono16"
+        )
+    if path.name.lower().endswith((".ome.tif", ".ome.tiff")):
+        tiff.header(path)
+
+
+class Settings(NamedTuple):
+    """What an image was taken with; None where it is not known."""
+
+    exposure_s: float | None = None
+    temperature_c: float | None = None
+
+
+def settings(path: Path) -> Settings:
+    """Read exposure time and temperature from headers of FITS, EXIF of TIFF and raw files."""
+    suffix = suffix_of(path)
+    with reading(path):
+        if suffix in fits.SUFFIXES:
+            return Settings(*fits.settings(path))
+        if suffix in camera_raw.SUFFIXES:
+            return Settings(camera_raw.exposure_s(path))
+        return Settings(tiff.exposure_s(path) if suffix in (".tif", ".tiff") else None)
 
 
 class Header(NamedTuple):
@@ -121,7 +163,7 @@ def header(path: Path) -> Header:
     suffix = suffix_of(path)
     if not is_image(path):
         with reading(path):
-            return Header(*_READERS[suffix].header(path))
+            return Header(*_reader(path).header(path))
     if suffix in (".tif", ".tiff"):
         return Header(*tiff.header(path))
     return Header(*frame_format(path), png.description(path) if suffix == ".png" else "")
@@ -130,8 +172,9 @@ def header(path: Path) -> Header:
 def _frames(path: Path, workers: int | None) -> Iterator[NDArray[Any]]:
     if not is_image(path):
         with reading(path):
-            yield from _READERS[suffix_of(path)].stream_frames(path)
+            yield from _reader(path).stream_frames(path)
         return
+    check_image(path)
     with suppress(UnsupportedFileError):
         count, rows, cols, bits = _native.file_format(path)
         if count == 1 or count * rows * cols * bits <= 8 * _AT_ONCE:

@@ -48,20 +48,22 @@ def find_files(
 
 
 def _matches(name: str | PathLike[str], folder: Path) -> list[Path]:
-    pattern = str(as_path("frames", name))
-    path = folder / pattern
+    given = as_path("frames", name)
+    path = folder / given
     file, _ = split(path)
     if file.is_dir() and file.suffix.lower() not in ZARR:
         raise FileError(f"{path}: is a folder, expected files: name them by a glob, {path}/*.tif")
     if file.exists():
         return [path]
-    if not glob.has_magic(pattern):
+    pattern, place = split(given)
+    if not glob.has_magic(str(pattern)):
         raise FileError(f"{path}: does not exist")
     # Unlike Path.glob, this leaves out hidden files, as a shell does.
-    found = glob.glob(pattern, root_dir=folder, recursive=True)  # noqa: PTH207
+    found = glob.glob(str(pattern), root_dir=folder, recursive=True)  # noqa: PTH207
     if not found:
         raise FileError(f"{path}: no file matches")
-    return sorted((folder / match for match in found), key=_natural)
+    behind = f":{place}" if place else ""
+    return sorted((folder / f"{match}{behind}" for match in found), key=_natural)
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

@@ -26,6 +26,10 @@ _SUBFILE_TYPE = 255  # TIFF tag
 
 _PHOTOMETRIC = 262  # TIFF tag
 
+_EXPOSURE_TIME = 33434  # TIFF tag: of DNG and EXIF
+
+_EXIF = 34665  # TIFF tag
+
 _MAX_COMPRESSION = 4096  # no lossless coding packs tighter
 
 _TIFF_LIMIT = 2**32 - 2**25  # bytes of pixels that leave space for the directories
@@ -39,6 +43,7 @@ def header(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any], str]:
     with reading(path), tifffile.TiffFile(path) as file:
         page: Any = file.pages[0]
         _check_page(path, page, file.filehandle.size)
+        _check_planes(path, file)
         count = max(len(file.pages), file.series[0].size // page.size)
         return (count, *page.shape), page.dtype, str(page.description)
 
@@ -51,6 +56,7 @@ def stream_frames(path: Path) -> Iterator[NDArray[Any]]:
             raise FileError(f"{path}: is broken: it has no pages")
         for page in file.pages:
             _check_page(path, page, file.filehandle.size)
+        _check_planes(path, file)
         if pages == 1 and file.series[0].size > file.pages[0].size:
             # A stack with a directory for its first frame only: mapped, not read at once.
             yield from tifffile.memmap(path, mode="r")[..., None, :, :].reshape(
@@ -81,6 +87,33 @@ def _check_page(path: Path, page: Any, length: int) -> None:
         )
     if page.nbytes > _MAX_COMPRESSION * length:
         raise FileError(f"{path}: claims {page.nbytes} bytes of pixels in a file of {length}")
+
+
+def _check_planes(path: Path, file: Any) -> None:
+    """Refuse an OME-TIFF whose pages are not frames of one thing: over time, or over depth."""
+    if not file.is_ome:
+        return
+    series = file.series[0]
+    *above, _, _ = series.shape
+    own = [k for k, page in enumerate(series.pages) if page is not None and page.parent is file]
+    places = np.unravel_index(own, above) if above else []
+    varied = [axis for axis, each in zip(series.axes, places, strict=False) if np.ptp(each)]
+    if len(file.series) > 1 or (varied and varied not in (["T"], ["Z"])):
+        sizes = " x ".join(map(str, series.shape))
+        images = f"{len(file.series)} images, the first " if len(file.series) > 1 else "pages "
+        raise FileError(
+            f"{path}: holds {images}of axes {series.axes} ({sizes}), expected one channel over "
+            "time (T) or depth (Z): export what the frames are to a file of its own"
+        )
+
+
+def exposure_s(path: Path) -> float | None:
+    """Exposure time in s, where the file has EXIF or tags of DNG."""
+    with tifffile.TiffFile(path) as file:
+        page: Any = file.pages[0]
+        exif = page.tags.valueof(_EXIF, default={})
+        found = page.tags.valueof(_EXPOSURE_TIME, default=exif.get("ExposureTime"))
+    return found[0] / found[1] if found and found[1] else None
 
 
 def write_frames(

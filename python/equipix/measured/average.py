@@ -24,7 +24,7 @@ from equipix._check import (
     positive_workers,
 )
 from equipix.errors import FileError, InputError, UnsupportedFileError
-from equipix.io.frames import frame_format, is_image, stream_frames
+from equipix.io.frames import check_image, frame_format, is_image, stream_frames
 from equipix.io.paths import find_files
 from equipix.io.record import made, now, read_record
 from equipix.measured.saturation import level_of
@@ -170,6 +170,8 @@ def _average_files(names: list[Any], how: _How) -> FrameStatistics:
     if any(path.suffix.lower() == ".npz" for path in paths):
         return _saved(paths, how)
     if how.rejection is None and all(map(is_image, paths)):
+        for path in paths:
+            check_image(path)
         with suppress(UnsupportedFileError):
             shape, dtype = frame_format(paths[0])
             mask = as_mask(how.mask, shape[1:])

@@ -94,6 +94,14 @@ class Colours:
             return f"{rows[0]}/"
         return ("" if self.period == (2, 2) else "/").join(rows)
 
+    def agrees(self, other: Colours) -> bool:
+        """Whether another pattern is this one; it may divide a colour into several."""
+        shape = tuple(np.lcm(self.period, other.period))
+        own, given = (np.array(each.labels)[each.numbers(shape)].flat for each in (self, other))
+        pairs = set(zip(own, given, strict=True))
+        own_names = all(label == colour or label not in self.labels for colour, label in pairs)
+        return own_names and len({label for _, label in pairs}) == len(pairs)
+
     def numbers(self, shape: tuple[int, ...]) -> NDArray[np.uint8]:
         """Number of the label of each pixel of a sensor of that shape (rows, cols)."""
         number = {label: k for k, label in enumerate(self.labels)}

@@ -1,9 +1,11 @@
 """Averages of exposures or levels, reduced one by one."""
 
 import copy
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, reduce
+from itertools import combinations_with_replacement
 from typing import Self
 
 import numpy as np
@@ -46,8 +48,12 @@ class Averaged:
         exposure alone.
     raw : bool
         Whether no dark was subtracted from averages of whole numbers.
+    darks : sequence of FrameStatistics
+        The dark frames that the darks of the exposures are made of; by default that of the first.
+    black : ndarray, shape (rows, cols), or None
+        Dark level that was subtracted from all where there are no dark frames, in DN.
     dark : FrameStatistics or None
-        The dark frames that were subtracted.
+        The dark that was subtracted from all; None of several.
     frames : list of int
         Number of frames of each exposure.
     names : list of str
@@ -69,7 +75,8 @@ class Averaged:
     saturation_key: str = "saturation"
     words: Words = EXPOSURES
     colours: Colours | None = None
-    dark: FrameStatistics | None = field(init=False, default=None)
+    darks: Sequence[FrameStatistics] = ()
+    black: Array | None = None
     frames: list[int] = field(init=False, default_factory=list)
     names: list[str] = field(init=False, default_factory=list)
     light: list[Light] = field(init=False, default_factory=list)
@@ -78,6 +85,8 @@ class Averaged:
     clipped: Clipping | None = field(init=False, default=None)
     pedestal: float = field(init=False, default=0.0)
     _is_counted: bool = field(init=False, default=False)
+    _first_dark: FrameStatistics | None = field(init=False, default=None)
+    _shares: list[tuple[float, ...]] = field(init=False, default_factory=list)
     _of_dark: list[float] = field(init=False, default_factory=list)
     _points: list[Array] = field(init=False, default_factory=list)
     _screened: int = field(init=False, default=0)  # samples of a pixel compared with the others
@@ -98,8 +107,10 @@ class Averaged:
             averaged.add(each)
         return averaged
 
-    def add(self, frames: FrameStatistics, name: str = "") -> None:
-        """Add the next exposure, which may have a name.
+    def add(
+        self, frames: FrameStatistics, name: str = "", shares: tuple[float, ...] | None = None
+    ) -> None:
+        """Add the next exposure, which may have a name, and shares of `darks` in its dark.
 
         Raises
         ------
@@ -110,11 +121,13 @@ class Averaged:
         exposure, shape = len(self.frames), frames.mean.shape
         if exposure == 0:
             self._missing = np.zeros(shape, np.uint32)
-            self.dark = frames.dark
-            if self.dark is not None:
-                self._refuse_saturated("'dark'", self.dark)
-                self._screen(self.dark)
-                self.step = self.dark.step
+            self._first_dark = frames.dark
+            if not self.darks and frames.dark is not None:
+                self.darks = (frames.dark,)
+            for dark in self.darks:
+                self._refuse_saturated("'dark'", dark)
+                self._screen(dark)
+                self.step = max(self.step, dark.step)
             self.values = np.empty((self.count, *shape), self.dtype)
             self.variances = np.empty((self.count, *shape), np.float32)
             self.saturated = np.zeros(shape, bool)
@@ -125,7 +138,7 @@ class Averaged:
                 f"{self.words.argument} holds means of shapes {self.saturated.shape} and {shape}, "
                 "expected one"
             )
-        if not same_statistics(frames.dark, self.dark):
+        if shares is None and not same_statistics(frames.dark, self._first_dark):
             raise InputError(
                 f"{self.words.place(exposure)} has another dark than the first: average all with "
                 "one 'dark'"
@@ -144,7 +157,8 @@ class Averaged:
         self.frames.append(count)
         self.names.append(name)
         self._screen(frames)
-        if self.dark is None:
+        self._shares.append(shares or (1.0,) * len(self.darks))
+        if self._first_dark is None:
             self._of_dark.append(_added_by_dark(frames, count))
         # Clipped samples scatter less: their bins would have most of the weight in the noise model.
         free = ~saturates if clipped is None else ~saturates & unclipped(frames, clipped)
@@ -199,24 +213,33 @@ class Averaged:
         """
         points = [each - (self.pedestal, 0, 0) for each in self._points]
         known = any(map(len, points))
-        if self.dark is not None:
-            signal, free = np.zeros(self.dark.mean.shape), self.dark.saturated == 0
-            points.append(_points(self.dark, signal, free, light_of(self.dark)))
+        for dark in self.darks:
+            signal, free = np.zeros(dark.mean.shape), dark.saturated == 0
+            points.append(_points(dark, signal, free, light_of(dark)))
             known |= self.gain is not None and len(points[-1]) > 0
         every = np.concatenate(points)
         if not known or (self.step == 0 and not every[:, 1].any()):
             return None
         return NoiseModel.fit(every, gain=self.gain, step=self.step)
 
+    @property
+    def dark(self) -> FrameStatistics | None:
+        """The dark that was subtracted from all; None of several."""
+        return self._first_dark if len(set(self._shares)) <= 1 else None
+
     def raw_values(self, exposure: int) -> Array:
         """Mean of an exposure before the dark was subtracted."""
         values: Array = self.values[exposure]
-        return values if self.dark is None else values + self.dark.mean
+        if not self.darks:
+            return values if self.black is None else values + self.black
+        pairs = zip(self._shares[exposure], self.darks, strict=True)
+        return np.asarray(values + sum(share * dark.mean for share, dark in pairs))
 
     @property
     def unsteady(self) -> str:
         """The exposure whose light varied most between its frames, or the dark; or nothing."""
-        if self.dark is not None and (stray := light_of(self.dark)).over_noise > STRAY:
+        stray = max(map(light_of, self.darks), key=lambda each: each.over_noise, default=Light())
+        if stray.over_noise > STRAY:
             return f"'dark': {stray.words} (limit {STRAY:g}). See that all its frames are dark"
         worst = max(range(len(self.light)), key=lambda k: self.light[k].over_noise)
         if not self.light[worst].over_noise > _NAMED:
@@ -229,24 +252,49 @@ class Averaged:
         )
 
     def models(self, noise: NoiseModel, dark_variance: float = 0.0) -> tuple[NoiseModel, ...]:
-        """Noise model of each mean frame less a dark of that variance, from that of one frame."""
-        return tuple(noise.of_mean(each, dark_variance=dark_variance) for each in self.frames)
+        """Noise model of each mean frame less a dark of that variance, from that of one frame.
+
+        What the dark of an exposure has beside `dark_variance` of all is added.
+        """
+        _, own = self._dark_variances(noise)
+        return tuple(
+            noise.of_mean(each, dark_variance=dark_variance + more)
+            for each, more in zip(self.frames, own, strict=True)
+        )
 
     def dark_variance(self, noise: NoiseModel) -> Floats | None:
-        """Variance of the dark that was subtracted from all, from the noise of one frame.
+        """Variance of the dark that is common to all exposures, from the noise of one frame.
 
-        Of a dark that is not kept it is what the averages state; None without any. One frame shows
-        no noise, and what exposures in bright light say of that of the dark may be far off: its
-        scatter between neighbours, which holds its pattern too, stands for it.
+        Of a dark that is not kept it is what the averages state; None without any.
         """
-        if self.dark is not None:
-            is_one = self.dark.count.max() <= 1
-            of_frame = _between_neighbours(self.dark.mean) if is_one else noise.scatter(0.0)
-            scatter = of_frame / np.maximum(self.dark.count, 1)
-            of_mean = noise.of_mean(int(self.dark.count.max()))
-            return np.asarray(scatter + of_mean.rounding_apart(0.0, self.dark.mean))
+        if self.darks:
+            return self._dark_variances(noise)[0]
         stated = float(np.mean(self._of_dark))
         return np.full(self.saturated.shape, stated) if stated > 0 else None
+
+    def _dark_variances(self, noise: NoiseModel) -> tuple[Floats | None, list[float]]:
+        """Variance of darks that counts as common to all exposures, and what each has beside it.
+
+        Darks Σ s D of two exposures have the covariance Σ s s' var(D). The largest of any two
+        exposures counts as that of all: the error of M is then not understated.
+        """
+        if not self.darks:
+            return None, [0.0] * len(self.frames)
+        variances = [_variance_of_dark(each, noise) for each in self.darks]
+
+        def covariance(one: tuple[float, ...], other: tuple[float, ...]) -> Floats:
+            triples = zip(one, other, variances, strict=True)
+            return np.asarray(sum(a * b * variance for a, b, variance in triples))
+
+        counts = Counter(self._shares)
+        if len(counts) == 1:
+            (shares,) = counts
+            return covariance(shares, shares), [0.0] * len(self.frames)
+        pairs = combinations_with_replacement(counts, 2)
+        common = reduce(np.maximum, (covariance(a, b) for a, b in pairs if a != b or counts[a] > 1))
+        beside = {each: np.maximum(covariance(each, each) - common, 0) for each in counts}
+        own = {each: float(np.nanmedian(variance)) for each, variance in beside.items()}
+        return common, [own[each] for each in self._shares]
 
     def bad_pixels(self, noise: NoiseModel | None) -> defects.BadPixels:
         """Bad pixels found before any fit; `noise` is the model of one frame, if known."""
@@ -257,10 +305,10 @@ class Averaged:
             if self._screened:
                 noisy |= defects.often_rejected(self._missing, self._screened)
         hot = np.zeros(self.saturated.shape, bool)
-        if self.dark is not None:
-            hot = defects.hot_pixels(self.dark, noise) | (self.dark.saturated > 0)
+        for dark in self.darks:
+            hot |= defects.hot_pixels(dark, noise) | (dark.saturated > 0)
         dead = None
-        if noise is not None or self.dark is not None:
+        if noise is not None or self.darks:
             dead = self._dead(noise) & ~hot
         return defects.BadPixels(saturated=self.saturated, dead=dead, hot=hot, noisy=noisy)
 
@@ -303,6 +351,19 @@ def _added_by_dark(frames: FrameStatistics, count: int) -> float:
     if count < 2:
         return 0.0
     return max(0.0, float(np.nanmedian(frames.variance_of_mean - frames.variance / count)))
+
+
+def _variance_of_dark(dark: FrameStatistics, noise: NoiseModel) -> Floats:
+    """Variance of the mean of dark frames, from the noise of one frame.
+
+    One frame shows no noise, and what exposures in bright light say of that of the dark may be far
+    off: its scatter between neighbours, which holds its pattern too, stands for it.
+    """
+    is_one = dark.count.max() <= 1
+    of_frame = _between_neighbours(dark.mean) if is_one else noise.scatter(0.0)
+    scatter = of_frame / np.maximum(dark.count, 1)
+    of_mean = noise.of_mean(int(dark.count.max()))
+    return np.asarray(scatter + of_mean.rounding_apart(0.0, dark.mean))
 
 
 def _between_neighbours(frame: Array) -> float:

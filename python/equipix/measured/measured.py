@@ -60,7 +60,7 @@ class Measured(ReadOnly):
     clipped : Clipping or None
         A saturation level that was not given, if the values show one.
     dark : ndarray, shape (rows, cols), or None
-        The dark frame that was subtracted, in DN, where it is known.
+        The dark frame that was subtracted from all, in DN, where it is known.
     dark_variance : ndarray, shape (rows, cols), float64, or None
         Its variance, in DN²: an error common to all exposures, so `variance` and `noise` are
         without it. None where it is unknown, or where an offset is sought, which takes all of it.
@@ -199,7 +199,8 @@ def _of_averaged(
     else:
         noise, variances = _noise_of(variance, averaged.values, words)
         model = None
-    bad_pixels, dark = averaged.bad_pixels(model), averaged.dark
+    bad_pixels = averaged.bad_pixels(model)
+    dark = averaged.black if averaged.dark is None else averaged.dark.mean
     return Measured(
         values=averaged.values,
         mask=union(bad_pixels.dead, bad_pixels.hot, bad_pixels.noisy),
@@ -208,7 +209,7 @@ def _of_averaged(
         bad_pixels=bad_pixels,
         saturation=averaged.saturation,
         clipped=averaged.clipped,
-        dark=None if dark is None else dark.mean.astype(averaged.values.dtype),
+        dark=None if dark is None else dark.astype(averaged.values.dtype),
         dark_variance=None if model is None else averaged.dark_variance(model),
         raw=averaged.raw,
         unsteady=averaged.unsteady,

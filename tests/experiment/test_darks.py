@@ -1,0 +1,324 @@
+"""Several darks: the one that fits an exposure is taken, one between two is interpolated."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import tifffile
+from astropy.io import fits
+
+import equipix
+from equipix import Experiment, LevelExperiment, errors, metrics, simulate
+from equipix.experiment.darks import mixed
+from equipix.io.frames import Settings, settings
+from equipix.measured.means import Averaged
+from given import write_dng
+
+SHAPE = (64, 80)
+SHIFTS = equipix.cross_pattern(5, 7)
+DARK_TIMES, TIMES = (0.5, 1.0, 4.0), (1.0, 1.0, 2.0, 2.0, 3.0)
+GAIN, READ_NOISE, BIAS = 0.25, 3.0, 100.0
+
+
+class Camera:
+    """A camera whose dark current differs between pixels, in DN/s, and its sensitivity."""
+
+    def __init__(self, seed=1):
+        self.rng = np.random.default_rng(seed)
+        self.truth = simulate.paper_sensitivity(SHAPE, rng=self.rng)
+        self.current = self.rng.uniform(20, 60, SHAPE)
+        beam = simulate.gaussian_beam(SHAPE, width=200, amplitude=2000)
+        self.light = simulate.exposures(self.truth, beam, SHIFTS)
+
+    def frames(self, light, time, count):
+        mean = BIAS + self.current * time + light * time
+        noise = np.sqrt(READ_NOISE**2 + GAIN * (mean - BIAS))
+        values = mean + noise * self.rng.standard_normal((count, *SHAPE))
+        return np.rint(values).astype(np.uint16)
+
+
+def entry(kind, frames, **keys):
+    lines = [f"[[{kind}]]", f'frames = "{frames}"']
+    return "\n".join([*lines, *(f"{key} = {value}" for key, value in keys.items())]) + "\n\n"
+
+
+def written(folder, camera, dark_count=40, times=TIMES):
+    """Write an experiment of exposures of several times; return its manifest."""
+    text = "[sensor]\nbit_depth = 16\n\n"
+    for time in DARK_TIMES:
+        np.save(folder / f"dark{time}.npy", camera.frames(0, time, dark_count))
+        text += entry("dark", f"dark{time}.npy", exposure_s=time)
+    for k, (time, light) in enumerate(zip(times, camera.light, strict=True)):
+        np.save(folder / f"{k}.npy", camera.frames(light, time, 20))
+        own = {"name": f'"p{k}"', "shift": SHIFTS[k].tolist(), "flux": time, "exposure_s": time}
+        text += entry("exposure", f"{k}.npy", **own)
+    (folder / "experiment.toml").write_text(text)
+    return folder / "experiment.toml"
+
+
+@pytest.fixture(scope="module")
+def camera():
+    return Camera()
+
+
+@pytest.fixture(scope="module")
+def manifest(camera, tmp_path_factory):
+    return written(tmp_path_factory.mktemp("darks"), camera)
+
+
+def edited(manifest, *changes):
+    """The manifest with changes, beside it."""
+    text = manifest.read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path = manifest.parent / "edited.toml"
+    path.write_text(text)
+    return path
+
+
+def refused(manifest, words, *changes):
+    with pytest.raises(errors.FileError, match=words):
+        Experiment.load(edited(manifest, *changes)).run(max_sweeps=1)
+
+
+@pytest.mark.parametrize("dark_count", [40, 4])
+def test_the_truth_is_found_within_the_stated_errors(tmp_path, dark_count):
+    """Also with few dark frames, whose noise is then as large as that of the exposures."""
+    camera = Camera(2)
+    cal = Experiment.load(written(tmp_path, camera, dark_count)).run(uncertainty=True)
+    error = metrics.relative_error(cal.sensitivity, camera.truth) * cal.sensitivity
+    z = float(np.sqrt(np.nanmean(np.square(error / cal.sensitivity_std))))
+    # 5120 pixels: 1 %, and draws of the error map 2 %. What darks have in common counts as that of
+    # all exposures: not understated, and overstated by less than a half.
+    assert 0.65 < z < 1.07
+    # 3 * 5120 degrees of freedom: five standard errors.
+    assert cal.reduced_chi2 == pytest.approx(1, abs=0.06)
+    assert cal.dark is None
+    with pytest.raises(errors.InputError, match="holds no dark frame"):
+        cal.correct(camera.frames(camera.light[0], 1.0, 1)[0])
+
+
+def test_one_between_two_is_interpolated_with_its_variance(manifest):
+    low, high = (
+        equipix.average(manifest.parent / f"dark{time}.npy", saturation=65535)
+        for time in DARK_TIMES[1:]
+    )
+    cal = Experiment.load(manifest).run(tolerance=1e-3)
+    frames = equipix.average(manifest.parent / "2.npy", saturation=65535)
+    wanted = frames.mean - (2 / 3 * low.mean + 1 / 3 * high.mean)  # 2 s between 1 s and 4 s
+    np.testing.assert_allclose(cal.weighted.exposures.values[2], wanted, rtol=1e-6, atol=1e-3)
+    found = mixed([low, high], (2 / 3, 1 / 3))
+    np.testing.assert_allclose(
+        found.variance_of_mean, 4 / 9 * low.variance_of_mean + 1 / 9 * high.variance_of_mean
+    )
+    # 40 frames of each: 1/(4/9 + 1/9) times as many.
+    assert np.unique(found.count).tolist() == [72]
+
+
+@pytest.mark.parametrize(
+    ("time", "shares"), [(1.0, {1.0: 1.0}), (2.5, {1.0: 0.5, 4.0: 0.5}), (3.98, {4.0: 1.0})]
+)
+def test_one_dark_that_all_exposures_take_is_that_of_the_result(tmp_path, camera, time, shares):
+    """Whether it is one of several, to 1 % of the time, or between two of them."""
+    cal = Experiment.load(written(tmp_path, camera, times=[time] * 5)).run(uncertainty=True)
+    means = [share * equipix.average(tmp_path / f"dark{t}.npy").mean for t, share in shares.items()]
+    np.testing.assert_array_equal(cal.dark, sum(means).astype(np.float32))
+    assert cal.reduced_chi2 == pytest.approx(1, abs=0.06)  # five standard errors
+
+
+def test_a_single_dark_is_the_same_with_and_without_keys(tmp_path, camera):
+    manifest = written(tmp_path, camera, times=[1.0] * 5)
+    rest = manifest.read_text().partition("[[exposure]]")[2]
+    bare = "".join(line for line in rest.splitlines(True) if not line.startswith("exposure_s"))
+    results = []
+    for head, exposures in (
+        ('[dark]\nframes = "dark1.0.npy"\n\n[[exposure]]', bare),
+        ('[[dark]]\nframes = "dark1.0.npy"\n\n[[exposure]]', bare),
+        ('[dark]\nframes = "dark1.0.npy"\ntemperature_c = -10\n\n[[exposure]]', bare),
+        ('[dark]\nframes = "dark1.0.npy"\nexposure_s = 1.0\n\n[[exposure]]', rest),
+    ):
+        manifest.write_text(head + exposures)
+        results.append(Experiment.load(manifest).run(tolerance=1e-3))
+    for other in results[1:]:
+        for name in ("sensitivity", "dark", "flags", "beam"):
+            np.testing.assert_array_equal(getattr(other, name), getattr(results[0], name))
+
+
+def variances_of(shares, counts=(4, 8)):
+    """Variance that is common, and what each exposure has beside it, with a noise of 2 DN."""
+    darks = [
+        equipix.average(np.random.default_rng(k).normal(100, 2, (n, 9, 12)))
+        for k, n in enumerate(counts)
+    ]
+    averaged = Averaged(count=len(shares), darks=tuple(darks))
+    rng = np.random.default_rng(9)
+    for each in shares:
+        frames = equipix.average(rng.normal(500, 9, (4, 9, 12)), dark=mixed(darks, each))
+        averaged.add(frames, "", each)
+    noise = equipix.NoiseModel(2.0, 0.0)
+    own = [each.dark_variance for each in averaged.models(noise)]
+    return float(np.median(averaged.dark_variance(noise))), own
+
+
+@pytest.mark.parametrize(
+    ("shares", "common", "own"),
+    [
+        ([(1.0, 0.0)] * 3, 1.0, [0, 0, 0]),  # 4/4 DN²
+        ([(0.5, 0.5)] * 2, 0.25 + 0.125, [0, 0]),
+        ([(1.0, 0.0), (0.0, 1.0)], 0.0, [1.0, 0.5]),
+        ([(1.0, 0.0), (1.0, 0.0), (0.0, 1.0)], 1.0, [0, 0, 0]),
+        ([(0.0, 1.0), (0.0, 1.0), (1.0, 0.0)], 0.5, [0, 0, 0.5]),
+        ([(1.0, 0.0), (0.5, 0.5)], 0.5, [0.5, 0]),
+    ],
+)
+def test_what_exposures_have_in_common_of_their_darks(shares, common, own):
+    found_common, found_own = variances_of(shares)
+    assert found_common == pytest.approx(common, rel=1e-12, abs=1e-12)
+    assert found_own == pytest.approx(own, rel=1e-12, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("words", "changes"),
+    [
+        (
+            r"no dark fits exposure 'p4' of 5 s: .* have 0.5, 1, 4 s, .* not extrapolated",
+            [("flux = 3.0\nexposure_s = 3.0", "flux = 3.0\nexposure_s = 5")],
+        ),
+        (
+            r"'exposure_s' of exposure 'p4' is not known, and the \[\[dark\]\] have 0.5, 1, 4 s",
+            [("flux = 3.0\nexposure_s = 3.0", "flux = 3.0")],
+        ),
+        (r"'exposure_s' of \[\[dark\]\] 1 is not known: write it", [("exposure_s = 0.5\n", "")]),
+        (
+            r"\[\[dark\]\] 1 and 2 do not differ: write 'exposure_s' or 'temperature_c'",
+            [("exposure_s = 0.5\n", "exposure_s = 1.0\n")],
+        ),
+        (
+            r"no dark fits exposure 'p0' of -12 °C within 0.5 K: they have -10 °C",
+            [
+                ('.npy"\nexposure_s', '.npy"\ntemperature_c = -10\nexposure_s'),
+                ('name = "p0"\n', 'name = "p0"\ntemperature_c = -12\n'),
+            ],
+        ),
+        (
+            r"'temperature_c' of exposure 'p0' is not known, .* have -10, -20 °C: write it",
+            [
+                ("exposure_s = 0.5\n", "exposure_s = 0.5\ntemperature_c = -10\n"),
+                ('dark1.0.npy"\n', 'dark1.0.npy"\ntemperature_c = -20\n'),
+                ('dark4.0.npy"\n', 'dark4.0.npy"\ntemperature_c = -10\n'),
+            ],
+        ),
+        (
+            r"'exposure_s' in \[\[dark\]\] 2 holds -1.0, expected a number of seconds",
+            [('dark1.0.npy"\nexposure_s = 1.0', 'dark1.0.npy"\nexposure_s = -1.0')],
+        ),
+        (
+            r"'dark1.0.npy' stands in \[\[dark\]\] 1 and in \[\[dark\]\] 2",
+            [("dark0.5.npy", "dark1.0.npy")],
+        ),
+        (r"unknown key 'time' in \[\[dark\]\] 1", [("exposure_s = 0.5\n", "time = 0.5\n")]),
+    ],
+)
+def test_what_does_not_fit_is_named(manifest, words, changes):
+    refused(manifest, words, *changes)
+
+
+def test_the_tolerance_of_the_temperature_can_be_raised(manifest):
+    path = edited(
+        manifest,
+        ("bit_depth = 16\n", "bit_depth = 16\ndark_temperature_tolerance_c = 2\n"),
+        ('.npy"\nexposure_s', '.npy"\ntemperature_c = -10\nexposure_s'),
+        ('name = "p0"\n', 'name = "p0"\ntemperature_c = -12\n'),
+    )
+    Experiment.load(path).run(tolerance=1e-2)
+
+
+def test_the_nearest_temperature_is_taken(manifest):
+    """Of two darks of one exposure time."""
+    path = edited(
+        manifest,
+        ("exposure_s = 0.5\n", "exposure_s = 1.0\ntemperature_c = -10.3\n"),
+        ('dark1.0.npy"\n', 'dark1.0.npy"\ntemperature_c = -10.0\n'),
+        ('dark4.0.npy"\n', 'dark4.0.npy"\ntemperature_c = -10.2\n'),
+    )
+    text = path.read_text()
+    path.write_text(text.replace("flux = ", "temperature_c = -10.1\nflux = "))
+    cal = Experiment.load(path).run(tolerance=1e-2)
+    frames, dark = (equipix.average(manifest.parent / f"{name}.npy") for name in (0, "dark1.0"))
+    wanted = frames.mean - dark.mean
+    np.testing.assert_allclose(cal.weighted.exposures.values[0], wanted, rtol=1e-6, atol=1e-3)
+
+
+def fits_levels(folder, camera, *, stated="", dark_times=(1.0, 4.0)):
+    """Levels of light by exposure time, as FITS files with headers; and their manifest."""
+    text = "[sensor]\nbit_depth = 16\n\n"
+    for kind, times in (("dark", dark_times), ("level", (1.0, 2.0, 3.0))):
+        for time in times:
+            light = 0 if kind == "dark" else 1000.0 * camera.truth
+            header = fits.Header({"EXPTIME": time, "CCD-TEMP": -10 + 0.05 * time, "SET-TEMP": -11})
+            frames = camera.frames(light, time, 8)
+            name = f"{kind}{time:g}.fits"
+            fits.writeto(folder / name, frames, header, overwrite=True)
+            text += entry(kind, name) + (stated if name == "level2.fits" else "")
+    (folder / "levels.toml").write_text(text)
+    return folder / "levels.toml"
+
+
+def test_headers_of_fits_files_give_what_the_manifest_leaves_out(tmp_path, camera):
+    path = fits_levels(tmp_path, camera)
+    assert settings(tmp_path / "level2.fits") == Settings(2.0, -9.9)
+    response = LevelExperiment.load(path).run()
+    darks = [equipix.average(tmp_path / f"dark{time}.fits", saturation=65535) for time in (1, 4)]
+    for k, shares in enumerate([(1.0, 0.0), (2 / 3, 1 / 3), (1 / 3, 2 / 3)]):
+        raw = equipix.average(tmp_path / f"level{k + 1}.fits", saturation=65535)
+        mean = (raw.mean - mixed(darks, shares).mean).mean()
+        assert response.levels[k] == pytest.approx(mean, rel=1e-4)
+    assert response.dark is None
+    assert not response.leaves_offset
+    # Light without dark is proportional to the exposure time, so lines hold.
+    # One degree of freedom in each of 5120 pixels: 2 %, and a model of the noise from 8 frames.
+    assert np.nanmean(response.reduced_chi2) == pytest.approx(1, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("stated", "words"),
+    [
+        (
+            "exposure_s = 3\n\n",
+            r"'level2.fits' holds 2 s, but 'exposure_s' of level '1' is 3 s: correct 'exposure_s'",
+        ),
+        (
+            "temperature_c = -12\n\n",
+            r"'level2.fits' holds -9.9 °C, but 'temperature_c' of level '1' is -12 °C",
+        ),
+    ],
+)
+def test_a_header_that_contradicts_the_manifest_is_named(tmp_path, camera, stated, words):
+    path = fits_levels(tmp_path, camera, stated=stated)
+    with pytest.raises(errors.FileError, match=words):
+        LevelExperiment.load(path).run()
+
+
+def test_files_of_one_entry_that_contradict_one_another_are_named(tmp_path, camera):
+    path = fits_levels(tmp_path, camera)
+    path.write_text(path.read_text().replace('"level2.fits"', '["level2.fits", "level3.fits"]', 1))
+    path.write_text(path.read_text().replace('[[level]]\nframes = "level3.fits"\n', ""))
+    words = r"'level2.fits' holds 2 s, but the mean of level '1' is 2.5 s: .* the files of level"
+    with pytest.raises(errors.FileError, match=words):
+        LevelExperiment.load(path).run()
+
+
+def test_exif_and_tags_give_the_exposure_time(tmp_path):
+    frame = np.zeros((8, 9), np.uint16)
+    tifffile.imwrite(
+        tmp_path / "a.tif", frame, photometric="minisblack", extratags=[(33434, "2I", 1, (1, 60))]
+    )
+    assert settings(tmp_path / "a.tif") == Settings(1 / 60)
+    tifffile.imwrite(tmp_path / "b.tif", frame, photometric="minisblack")
+    assert settings(tmp_path / "b.tif") == Settings()
+    assert settings(write_dng(tmp_path / "c.dng", np.zeros((100, 122), np.uint16))).exposure_s == (
+        pytest.approx(1 / 50)
+    )
+    np.save(tmp_path / "d.npy", frame)
+    assert settings(tmp_path / "d.npy") == Settings()
