@@ -4,13 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
+import shutil
+import subprocess
 import zlib
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, NamedTuple
 
+import ccdproc
+import imageio.v2
+import imageio.v3
 import numpy as np
 import pytest
+import skimage.io
 import tifffile
+from astropy.io import fits
+from astropy.nddata import CCDData, StdDevUncertainty
 from PIL import Image
 
 import equipix
@@ -18,7 +27,7 @@ from equipix import bolometer, hardware, nuc, simulate
 from equipix._check import Array
 from equipix.errors import FileError, InputError
 from equipix.exposures.positions import Orientation
-from equipix.findings import Finding
+from equipix.findings import Finding, usable
 from equipix.io.formats import load_pages, refuse_saved, save_pages
 from equipix.io.record import UNSAVED, Map, Record, read_record
 from equipix.saved_results import RECORDS
@@ -116,22 +125,82 @@ def test_every_kind_comes_back_bit_by_bit(tmp_path, name, suffix):
     assert path.read_bytes() == whole
 
 
+def skimage_read(path):
+    return skimage.io.imread(path)
+
+
+def pillow(path):
+    with Image.open(path) as opened:
+        assert opened.n_frames == 1
+        return np.asarray(opened)
+
+
+def imagej(path):
+    """Debian's ImageJ, on a display that nobody sees."""
+    if not (shutil.which("imagej") and shutil.which("xvfb-run")):
+        assert "CI" not in os.environ, "apt-get install imagej xvfb xauth"
+        pytest.skip("no imagej, or no xvfb-run")
+    macro = path.with_suffix(".ijm")
+    macro.write_text(
+        f'setBatchMode(true); open("{path}"); print(nImages, nSlices, bitDepth());'
+        "for (y = 0; y < getHeight(); y++) { line = '';"
+        "for (x = 0; x < getWidth(); x++) line += d2s(getPixel(x, y), -9) + ' '; print(line); }"
+    )
+    command = ["xvfb-run", "-a", "imagej", "-b", macro]
+    # Its status is 1 after any macro.
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    lines = done.stdout.splitlines()
+    assert "1 1 32" in lines, done.stderr
+    rows = lines[lines.index("1 1 32") + 1 :]
+    return np.array([row.split() for row in rows if row], float).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    "read", [tifffile.imread, imageio.v2.imread, imageio.v3.imread, skimage_read, pillow, imagej]
+)
 @pytest.mark.parametrize("name", KINDS)
-def test_other_software_reads_the_pages(tmp_path, name):
-    KINDS[name].save(tmp_path / "a.tif")
-    first = next(iter(load_pages(tmp_path / "a.tif")[0].values()))
-    with tifffile.TiffFile(tmp_path / "a.tif") as file:
-        assert file.series[0].shape[-2:] == first.shape[-2:]
-        assert sum(len(each.pages) for each in file.series) == len(file.pages)
-    with pytest.raises(FileError, match=f"holds .*{KINDS[name].KIND}, expected raw frames"):
-        refuse_saved(tmp_path / "a.tif")
-    # The first page is what they show.
-    image = tifffile.imread(tmp_path / "a.tif", key=0)
+def test_other_programs_show_one_grey_image(tmp_path, name, read):
+    if read is imagej and name not in ("calibration", "averages"):
+        pytest.skip("a second each: one of 1 and one of DN")
+    path = tmp_path / "a.tif"
+    KINDS[name].save(path)
+    image = read(path)
     assert image.dtype == np.float32
     assert np.isfinite(image).all()
     np.testing.assert_array_equal(image, KINDS[name].viewed().image.astype(np.float32))
-    with Image.open(tmp_path / "a.tif") as opened:
-        np.testing.assert_array_equal(np.asarray(opened), image)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_saved_result_is_no_raw_frame(tmp_path, name):
+    KINDS[name].save(tmp_path / "a.tif")
+    with pytest.raises(FileError, match=f"holds .*{KINDS[name].KIND}, expected raw frames"):
+        refuse_saved(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize("name", ["calibration", "response"])
+def test_astronomers_read_fits_without_arguments(tmp_path, name):
+    result, path = KINDS[name], tmp_path / "a.fits"
+    result.save(path)
+    flat = CCDData.read(path)
+    assert flat.unit.is_equivalent("")
+    np.testing.assert_array_equal(flat.mask, ~usable(result.flags))
+    assert np.isfinite(flat.data).all()
+    assert (flat.data[flat.mask] == 1).all()
+    with fits.open(path, checksum=True) as units:
+        assert {"MASK", "FLAGS"} <= {unit.name for unit in units}
+        assert all({"CHECKSUM", "DATASUM"} <= set(unit.header) for unit in units)
+    if name == "calibration":
+        assert isinstance(flat.uncertainty, StdDevUncertainty)
+        np.testing.assert_array_equal(flat.uncertainty.array, result.viewed().std)
+        np.testing.assert_array_equal(fits.getdata(path, "SENSITIVITY"), result.sensitivity)
+        np.testing.assert_array_equal(fits.getdata(path, "BEAM"), result.beam)
+        # Of a frame less its dark ccdproc gives what this package does.
+        frame = np.random.default_rng(1).uniform(100, 200, SHAPE)
+        found = ccdproc.flat_correct(CCDData(frame, unit="adu"), flat, norm_value=1)
+        wanted = result.correct(frame, dark=None)
+        valid = np.isfinite(wanted)
+        assert valid.sum() > 0.9 * valid.size
+        np.testing.assert_allclose(found.data[valid], wanted[valid], rtol=1e-14)
 
 
 def test_all_records_are_tested():

@@ -1,7 +1,7 @@
 """Frames and masks from image files, by whichever reader decodes them."""
 
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -101,11 +101,20 @@ def frame_format(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any]]:
     """
     if not is_image(path):
         return header(path)[:2]
-    try:
+    with leaving_others(path):
         count, rows, cols, bits = _native.file_format(path)
-    except UnsupportedFileError:
-        return tiff.header(path)[:2]
-    return (count, rows, cols), np.dtype(f"uint{bits}")
+        return (count, rows, cols), np.dtype(f"uint{bits}")
+    return tiff.header(path)[:2]
+
+
+@contextmanager
+def leaving_others(*paths: Path) -> Iterator[None]:
+    """Leave to tifffile what the compiled reader does not decode, saved results among it."""
+    try:
+        yield
+    except FileError as error:
+        if not isinstance(error, UnsupportedFileError) and not any(map(tiff.is_result, paths)):
+            raise
 
 
 class Header(NamedTuple):
@@ -132,7 +141,7 @@ def _frames(path: Path, workers: int | None) -> Iterator[NDArray[Any]]:
         with reading(path):
             yield from _READERS[suffix_of(path)].stream_frames(path)
         return
-    with suppress(UnsupportedFileError):
+    with leaving_others(path):
         count, rows, cols, bits = _native.file_format(path)
         if count == 1 or count * rows * cols * bits <= 8 * _AT_ONCE:
             yield _native.read_file(path, workers)
