@@ -25,6 +25,7 @@ COMMANDS = {
     "inspect": ("calibrate", "Show main figures of a result, and draw its maps."),
     "compare": ("calibrate", "Show how far calibrations of one sensor agree."),
     "report": ("report", "Write results as one page, judged by limits."),
+    "convert": ("report", "Write a result in another format, for other programs."),
     "average": ("frames", "Mean and variance of every pixel over many frames."),
     "correct": ("frames", "Correct frames by a calibration or by response curves."),
     "nuc": ("nuc", "Uniform source: fit response curves, find bad pixels, measure quality."),

@@ -23,6 +23,7 @@ from equipix._check import (
     positive_workers,
 )
 from equipix.errors import FileError, InputError
+from equipix.io.formats import ONLY_RESULTS
 from equipix.io.frames import frame_format, is_image, leaving_others, stream_frames
 from equipix.io.paths import find_files
 from equipix.io.record import read_record
@@ -159,7 +160,7 @@ def _paths_or_frames(source: Any) -> list[Any] | Array | Iterator[Any]:
 
 def _average_files(names: list[Any], how: _How) -> FrameStatistics:
     paths = find_files(names)
-    if any(path.suffix.lower() == ".npz" for path in paths):
+    if any(path.suffix.lower() in ONLY_RESULTS for path in paths):
         return _saved(paths, how)
     if how.rejection is None and all(map(is_image, paths)):
         with leaving_others(*paths):
