@@ -84,7 +84,7 @@ def convert(
     force: terminal.Force = False,
     as_json: terminal.Json = False,
 ) -> None:
-    """Write a result in another format, with the map that other programs use."""
+    """Write a result in another format, for other programs."""
     terminal.check_output(output, [result], force=force)
     content = load(result)
     options: dict[str, Any] = {"use": use, "mean_one": mean_one} if use or mean_one else {}
