@@ -33,7 +33,8 @@ def load(path: str | PathLike[str]) -> Any:
     Parameters
     ----------
     path : str or path
-        The file; its suffix names the format: .tif or .npz, of a table of words .bin, .hex or .h.
+        The file; its suffix names the format: .tif, .npz, .fits, .nxs or .asdf, of a table of words
+        .bin, .hex or .h.
 
     Returns
     -------
