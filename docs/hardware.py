@@ -7,7 +7,7 @@ which the adaptive loop stops converging, on the standard scene of `simulate.Mov
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,7 +51,9 @@ def two_point(material: str = "InSb", shape: tuple[int, int] = SHAPE) -> tuple[A
     levels = [
         equipix.average(array.frames(light, 64, rng=k)) for k, light in enumerate((3e6, 14e6))
     ]
-    return array, nuc.fit(levels, order=1)
+    response = nuc.fit(levels, order=1)
+    named = response.metadata | {"sensor": {"bit_depth": array.bit_depth}}
+    return array, replace(response, metadata=named)
 
 
 def frames_of(array: StaringArray) -> list[Any]:

@@ -21,8 +21,8 @@ RECORDS = (Calibration, DynamicCorrection, FrameStatistics, Polynomial, Response
 
 SUFFIXES = (*formats.SUFFIXES, *table.SUFFIXES)
 
-READ = f"{', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}"
-"""Suffixes of what is read, in words."""
+READ = ".tif, .npz, .fits, .nxs, .asdf, .bin, .hex or .h"
+"""What is read, in words: of each format one suffix."""
 
 _NO_CORRECTIONS = (
     (DynamicCorrection, "a dynamic correction", "save its correction(...) of a state"),
@@ -38,8 +38,8 @@ def load(path: str | PathLike[str]) -> Any:
     Parameters
     ----------
     path : str or path
-        The file; its suffix names the format: .tif, .tiff or .npz, of a table of words .bin, .hex
-        or .h.
+        The file; its suffix names the format: .tif, .npz, .fits, .nxs or .asdf, of a table of words
+        .bin, .hex or .h.
 
     Returns
     -------

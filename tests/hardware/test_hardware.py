@@ -10,12 +10,14 @@ import subprocess
 
 import numpy as np
 import pytest
+import tifffile
 
 import equipix
 import hardware as docs
 import reference
 from equipix import Flag, Polynomial, errors, hardware, nuc
-from equipix.findings import Finding
+from equipix.findings import Finding, usable
+from equipix.hardware.table import UPLOAD
 from equipix.io.tiff import write_frames
 from equipix.simulate import StaringArray
 
@@ -203,7 +205,8 @@ def test_files_come_back_bit_by_bit(made, tmp_path, suffix, bits):
 def test_a_memory_image_packs_a_word_a_pixel(made, tmp_path):
     table = hardware.Table.of(made[1], dac_bits=8, offset_bits=12, gain_bits=12, lowest=300.0)
     table.save(tmp_path / "table.hex")
-    lines = (tmp_path / "table.hex").read_text().splitlines()[2:]
+    text = (tmp_path / "table.hex").read_text()
+    lines = [line for line in text.splitlines() if not line.startswith("//")]
     assert len(lines) == SHAPE[0] * SHAPE[1]
     word = int(lines[0], 16)
     assert word >> 24 == table.coarse[0, 0]
@@ -244,6 +247,90 @@ def test_the_function_of_the_c_header_gives_the_same_words(made, tmp_path, out_b
     words = words_of(table, 30)
     done = subprocess.run([program], input=words.tobytes(), capture_output=True, check=True)
     assert np.array_equal(np.frombuffer(done.stdout, np.uint16), table.apply(words).ravel())
+
+
+@pytest.mark.parametrize("bits", [8, 0])
+def test_files_say_in_words_what_the_numbers_are(made, tmp_path, bits):
+    table = hardware.Table.of(made[1], dac_bits=bits, gain_bits=12)
+    f = table.format
+    for suffix in (".hex", ".h"):
+        table.save(tmp_path / f"table{suffix}")
+        said = " ".join((tmp_path / f"table{suffix}").read_text().replace("//", "").split())
+        ahead = (
+            f"after the DAC has subtracted coarse * 2^{f.coarse} DN from the raw value."
+            if bits
+            else "of the raw value: no DAC subtracts anything ahead of the ADC."
+        )
+        for words in (
+            f"x: word of the ADC, 14 bits, unsigned, in steps of 2^0 DN, {ahead}",
+            f"z = {f.base} + round((gain * x * 2^{f.gain + f.adc} + offset * 2^{f.offset}) / "
+            f"2^{f.out}), rounded half to even, limited to 0 to 65535.",
+            f"(z + {f.zero}) * 2^{f.out}",
+            "offset: 12 bits, two's complement.",
+            f"gain: 12 bits, unsigned, in steps of 2^{f.gain}.",
+            "gain 0: do not use this pixel",
+        ):
+            assert words in said
+
+
+def test_without_a_dac_the_adc_sees_raw_values(made, tmp_path):
+    response = made[1]
+    table = hardware.Table.of(response, dac_bits=0)
+    words = words_of(table)
+    # A step of the ADC is 1 DN: words are the raw values.
+    np.testing.assert_array_equal(table.digitise(words), np.where(table.gain > 0, words, 0))
+    rounding = 2.0**table.format.out / 2 + table.metadata["largest_error_dn"]
+    away = np.abs(table.correct(words[0] * 1.0) - response.correct(words[0] * 1.0))
+    top = 2.0**table.format.out * (2**16 - 1)
+    inside = (response.correct(words[0] * 1.0) > 0) & (response.correct(words[0] * 1.0) < top)
+    assert away[inside].max() <= rounding * (1 + 1e-9)
+    for suffix in SUFFIXES:
+        table.save(tmp_path / f"table{suffix}")
+        assert same(equipix.load(tmp_path / f"table{suffix}"), table)
+    assert "coarse[" not in (tmp_path / "table.h").read_text()
+    assert (
+        "coarse" not in (tmp_path / "table.hex").read_text().splitlines()[-SHAPE[0] * SHAPE[1] - 1]
+    )
+    program = compiled(tmp_path, FILTER.format(name="table", upper="TABLE"))
+    done = subprocess.run([program], input=words.tobytes(), capture_output=True, check=True)
+    assert np.array_equal(np.frombuffer(done.stdout, np.uint16), table.apply(words).ravel())
+    with pytest.raises(errors.InputError, match="'dac_step' is 2.0, but 'dac_bits' is 0"):
+        hardware.Table.of(response, dac_bits=0, dac_step=2.0)
+    with pytest.raises(errors.InputError, match="'dac_bits' is 4, expected 8 to 16 or 0 bits"):
+        hardware.Table.of(response, dac_bits=4)
+    with pytest.raises(errors.InputError, match="'gain_bits' is 0, expected 8 to 16 bits"):
+        hardware.Table.of(response, gain_bits=0)
+
+
+@pytest.mark.parametrize(("sensor", "bits"), [({"bit_depth": 12}, 12), ({"bit_depth": 4}, 8)])
+def test_the_adc_has_the_bits_of_the_sensor(sensor, bits):
+    kept = Polynomial(
+        polynomial(0.0, 1.0).coefficients, polynomial(0.0, 1.0).flags, {"sensor": sensor}
+    )
+    assert hardware.Table.of(kept).format.adc_bits == bits
+    assert hardware.Table.of(kept, adc_bits=16).format.adc_bits == 16
+    # Where they are unknown.
+    assert hardware.Table.of(polynomial(0.0, 1.0)).format.adc_bits == 14
+
+
+def test_gains_for_the_upload_of_a_camera(made, tmp_path, run):
+    response = made[1]
+    response.save(tmp_path / "response.npz")
+    command = ["hardware", tmp_path / "response.npz", "--preset", "upload", "-o"]
+    assert run(*command, tmp_path / "gain.tif")[0] == 0
+    gain = tifffile.imread(tmp_path / "gain.tif")
+    assert gain.dtype == np.uint16
+    used = usable(response.flags)
+    np.testing.assert_array_equal(gain[used], np.rint(1024 * response.coefficients[1][used]))
+    assert not gain[~used].any()
+    with tifffile.TiffFile(tmp_path / "gain.tif") as file:
+        assert "gain: 12 bits, unsigned, in steps of 2^-10." in file.pages[0].description
+    planes = np.array(response.coefficients)
+    planes[1, 3, 4] = 4.5
+    with pytest.raises(
+        errors.InputError, match="gain words of 1 usable pixels do not fit.*13 bits"
+    ):
+        hardware.Table.of(Polynomial(planes, response.flags), **UPLOAD)
 
 
 def test_two_c_headers_go_into_one_program(made, tmp_path):

@@ -463,7 +463,9 @@ def test_output_appears_whole_or_not_at_all(tmp_path: Path) -> None:
         save_pages(tmp_path / "none" / "out.tif", PAGES, {})
     with pytest.raises(FileError, match="cannot be written"):
         save_pages(path / "out.tif", PAGES, {})
-    with pytest.raises(InputError, match=r"expected the suffix \.tif, \.npz or \.fits"):
+    with pytest.raises(
+        InputError, match=r"expected the suffix \.tif, \.npz, \.fits, \.nxs or \.asdf"
+    ):
         save_pages(tmp_path / "out.jpg", PAGES, {})
     assert list(tmp_path.iterdir()) == [path]
 

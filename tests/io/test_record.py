@@ -4,22 +4,36 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
+import shutil
+import subprocess
 import zlib
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from itertools import pairwise
 from typing import Annotated, Any, Literal, NamedTuple
 
+import ccdproc
+import imageio.v2
+import imageio.v3
 import numpy as np
 import pytest
+import skimage.io
 import tifffile
+from astropy.io import fits
+from astropy.nddata import CCDData, StdDevUncertainty
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
+from nexusformat.nexus import nxload
 from PIL import Image
 
 import equipix
-from equipix import bolometer, hardware, lens, nuc, simulate
+from equipix import Flag, bolometer, hardware, lens, nuc, simulate
 from equipix._check import Array
-from equipix.errors import FileError, InputError
+from equipix.errors import EquipixError, FileError, InputError
 from equipix.exposures.positions import Orientation
-from equipix.findings import Finding
+from equipix.findings import Finding, usable
 from equipix.io.formats import load_pages, refuse_saved, save_pages
 from equipix.io.record import UNSAVED, Map, Record, read_record
 from equipix.saved_results import RECORDS
@@ -28,7 +42,7 @@ from equipix.scene.scene_correction import SceneState
 from records import rewrite
 
 SHAPE = (24, 32)
-SUFFIXES = (".tif", ".npz", ".fits")
+SUFFIXES = (".tif", ".npz", ".fits", ".nxs", ".asdf")
 
 
 def measured(level, count=6, seed=0):
@@ -134,22 +148,235 @@ def test_every_kind_states_versions_and_the_time(name):
         assert found["options"]
 
 
+def skimage_read(path):
+    return skimage.io.imread(path)
+
+
+def pillow(path):
+    with Image.open(path) as opened:
+        assert opened.n_frames == 1
+        return np.asarray(opened)
+
+
+def imagej(path):
+    """Debian's ImageJ, on a display that nobody sees."""
+    if not (shutil.which("imagej") and shutil.which("xvfb-run")):
+        left_out = pytest.fail if os.environ.get("CI") else pytest.skip
+        left_out("no imagej, or no xvfb-run: apt-get install imagej xvfb xauth")
+    macro = path.with_suffix(".ijm")
+    macro.write_text(
+        f'setBatchMode(true); open("{path}"); print(nImages, nSlices, bitDepth());'
+        "for (y = 0; y < getHeight(); y++) { line = '';"
+        "for (x = 0; x < getWidth(); x++) line += d2s(getPixel(x, y), -9) + ' '; print(line); }"
+    )
+    command = ["xvfb-run", "-a", "imagej", "-b", macro]
+    # Its status is 1 after any macro.
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    lines = done.stdout.splitlines()
+    assert "1 1 32" in lines, done.stderr
+    rows = lines[lines.index("1 1 32") + 1 :]
+    return np.array([row.split() for row in rows if row], float).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    "read", [tifffile.imread, imageio.v2.imread, imageio.v3.imread, skimage_read, pillow, imagej]
+)
 @pytest.mark.parametrize("name", KINDS)
-def test_other_software_reads_the_pages(tmp_path, name):
-    KINDS[name].save(tmp_path / "a.tif")
-    first = next(iter(load_pages(tmp_path / "a.tif")[0].values()))
-    with tifffile.TiffFile(tmp_path / "a.tif") as file:
-        assert file.series[0].shape[-2:] == first.shape[-2:]
-        assert sum(len(each.pages) for each in file.series) == len(file.pages)
-    with pytest.raises(FileError, match=f"holds .*{KINDS[name].KIND}, expected raw frames"):
-        refuse_saved(tmp_path / "a.tif")
-    # The first page is what they show.
-    image = tifffile.imread(tmp_path / "a.tif", key=0)
+def test_other_programs_show_one_grey_image(tmp_path, name, read):
+    if read is imagej and name not in ("calibration", "averages"):
+        pytest.skip("a second each: one of 1 and one of DN")
+    path = tmp_path / "a.tif"
+    KINDS[name].save(path)
+    image = read(path)
     assert image.dtype == np.float32
     assert np.isfinite(image).all()
     np.testing.assert_array_equal(image, KINDS[name].viewed().image.astype(np.float32))
-    with Image.open(tmp_path / "a.tif") as opened:
-        np.testing.assert_array_equal(np.asarray(opened), image)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("name", KINDS)
+def test_a_saved_result_is_no_raw_frame(tmp_path, name, suffix):
+    path, words = tmp_path / f"a{suffix}", f"holds .*{KINDS[name].KIND}, expected raw frames"
+    KINDS[name].save(path)
+    with pytest.raises(FileError, match=words):
+        refuse_saved(path)
+    if isinstance(KINDS[name], equipix.FrameStatistics):
+        assert differences(KINDS[name], equipix.average(path)) == []
+    else:
+        with pytest.raises(FileError, match=words):
+            equipix.average(path)
+
+
+@pytest.mark.parametrize("name", ["calibration", "response"])
+def test_astronomers_read_fits_without_arguments(tmp_path, name):
+    result, path = KINDS[name], tmp_path / "a.fits"
+    result.save(path)
+    flat = CCDData.read(path)
+    assert flat.unit.is_equivalent("")
+    np.testing.assert_array_equal(flat.mask, ~usable(result.flags))
+    assert np.isfinite(flat.data).all()
+    assert (flat.data[flat.mask] == 1).all()
+    with fits.open(path, checksum=True) as units:
+        assert {"MASK", "FLAGS"} <= {unit.name for unit in units}
+        assert all({"CHECKSUM", "DATASUM"} <= set(unit.header) for unit in units)
+    if name == "calibration":
+        assert isinstance(flat.uncertainty, StdDevUncertainty)
+        np.testing.assert_array_equal(flat.uncertainty.array, result.viewed().std)
+        np.testing.assert_array_equal(fits.getdata(path, "SENSITIVITY"), result.sensitivity)
+        np.testing.assert_array_equal(fits.getdata(path, "BEAM"), result.beam)
+        # Of a frame less its dark ccdproc gives what this package does.
+        frame = np.random.default_rng(1).uniform(100, 200, SHAPE)
+        found = ccdproc.flat_correct(CCDData(frame, unit="adu"), flat, norm_value=1)
+        wanted = result.correct(frame, dark=None)
+        valid = np.isfinite(wanted)
+        assert valid.sum() > 0.9 * valid.size
+        np.testing.assert_allclose(found.data[valid], wanted[valid], rtol=1e-14)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_nexus_holds_a_flat_field(tmp_path, name):
+    result, path = KINDS[name], tmp_path / "a.nxs"
+    result.save(path)
+    root = nxload(path)
+    detector, viewed = root.entry.instrument.detector, result.viewed()
+    if isinstance(result, equipix.FrameStatistics):
+        np.testing.assert_array_equal(detector.data.nxdata, result.mean)
+        np.testing.assert_array_equal(root.entry["data"].nxerrors.nxdata, viewed.std)
+        return
+    flat = detector.flatfield.nxdata
+    inverse = viewed.image if name.startswith("calibration") else 1 / viewed.image
+    np.testing.assert_array_equal(flat, inverse)
+    np.testing.assert_array_equal(root.entry["data"].nxsignal.nxdata, flat)
+    assert not detector.flatfield_applied.nxdata
+    bits, flags = detector.pixel_mask.nxdata, result.flags
+    np.testing.assert_array_equal(bits != 0, viewed.mask)
+    np.testing.assert_array_equal((bits & 2) != 0, viewed.mask & ((flags & Flag.DEAD) != 0))
+    assert ((bits & 0xFFFF) == bits).all()
+    if viewed.std is not None:
+        np.testing.assert_array_equal(detector.flatfield_errors.nxdata, viewed.std)
+
+
+def test_pixel_masks_have_the_bits_of_nexus(tmp_path):
+    flags = np.array([[0, Flag.SATURATED, Flag.DEAD, Flag.HOT, Flag.TELEGRAPH, Flag.NONLINEAR]])
+    flags = (flags | np.where(flags > Flag.SATURATED, Flag.DO_NOT_USE, 0)).astype(np.uint32)
+    equipix.Polynomial(np.ones((2, 1, 6)), flags).save(tmp_path / "a.nxs")
+    mask = nxload(tmp_path / "a.nxs").entry.instrument.detector.pixel_mask.nxdata
+    assert mask.tolist() == [[0, 0, 1 << 1, 1 << 3, 1 << 4, 1 << 8]]
+
+
+@pytest.mark.parametrize("use", [None, "flat", "gain"])
+@pytest.mark.parametrize("mean_one", [False, True])
+@pytest.mark.parametrize("name", ["calibration", "calibration in colours", "response"])
+def test_a_map_for_either_use(tmp_path, name, mean_one, use):
+    result, path = KINDS[name], tmp_path / "a.fits"
+    own = "flat" if name.startswith("calibration") else "gain"
+    use_is = use or own
+    result.save(path, use=use, mean_one=mean_one)
+    assert differences(result, equipix.load(path)) == []
+    found, read = result.to_ccddata(use=use, mean_one=mean_one), CCDData.read(path)
+    assert read.header["MAP"] == ("sensitivity" if use_is == "flat" else "gain")
+    for one in (found, read):
+        np.testing.assert_array_equal(one.data, read.data)
+        np.testing.assert_array_equal(one.mask, ~usable(result.flags))
+        assert one.unit.is_equivalent("")
+    viewed, good = result.viewed(), ~found.mask
+    wanted = viewed.image if use_is == own else 1 / viewed.image
+    wanted = wanted / wanted[good].mean() if mean_one else wanted
+    np.testing.assert_allclose(found.data[good], wanted[good], rtol=1e-6)
+    assert (found.data[~good] == 1).all()
+    if mean_one:
+        assert found.data[good].mean() == pytest.approx(1, abs=1e-6)
+    if viewed.std is not None:
+        relative = found.uncertainty.array[good] / found.data[good]
+        np.testing.assert_allclose(relative, (viewed.std / viewed.image)[good], rtol=1e-6)
+    table = result.to_xarray(use=use, mean_one=mean_one)
+    assert dict(table.sizes) == dict(zip(("row", "col"), SHAPE, strict=True))
+    values = table["sensitivity" if use_is == "flat" else "gain"]
+    assert values.attrs["units"] == "1"
+    np.testing.assert_array_equal(values, np.where(good, found.data, np.nan))
+    np.testing.assert_array_equal(table["flags"], result.flags)
+    assert len(table["flags"].attrs["flag_masks"]) == len([*Flag])
+    assert ("std" in table) == (viewed.std is not None)
+
+
+def test_a_mean_of_frames_has_one_use():
+    frames = KINDS["averages"]
+    assert frames.to_xarray()["mean"].attrs["units"] == "DN"
+    assert str(frames.to_ccddata().unit) == "adu"
+    for options in ({"use": "gain"}, {"mean_one": True}):
+        with pytest.raises(InputError, match="is a mean of frames, neither a flat nor a gain"):
+            frames.to_xarray(**options)
+    with pytest.raises(InputError, match="'use' is 'sum', expected 'flat', 'gain' or None"):
+        KINDS["response"].to_xarray(use="sum")
+    with pytest.raises(InputError, match=r"no map for other programs; its correction\(\) has one"):
+        learned("gated").to_ccddata()
+
+
+@pytest.mark.parametrize("library", ["xarray", "asdf"])
+def test_a_missing_library_is_named(tmp_path, monkeypatch, library):
+    monkeypatch.setitem(__import__("sys").modules, library, None)
+    calls = {
+        "asdf": lambda result: result.save(tmp_path / "a.asdf"),
+        "xarray": lambda result: result.to_xarray(),
+    }
+    with pytest.raises(EquipixError, match=f"need {library}, which is not .*equipix.{library}"):
+        calls[library](KINDS["response"])
+
+
+@pytest.mark.parametrize("name", [*KINDS, "state"])
+def test_convert_loses_nothing_on_any_way(tmp_path, run, name):
+    (learned("gated") if name == "state" else KINDS[name]).save(tmp_path / "0.npz")
+    files = [tmp_path / f"{k}{suffix}" for k, suffix in enumerate([".npz", *SUFFIXES, ".npz"])]
+    for one, other in pairwise(files):
+        assert run("convert", one, other)[0] == 0
+    assert files[0].read_bytes() == files[-1].read_bytes()
+
+
+def test_convert_writes_the_map_that_is_asked_for(tmp_path, run):
+    path, table = tmp_path / "a.npz", tmp_path / "a.hex"
+    KINDS["calibration"].save(path)
+    assert run("convert", path, tmp_path / "a.tif", "--as", "gain", "--mean-one")[0] == 0
+    wanted = KINDS["calibration"].viewed().exported("gain", mean_one=True).image
+    np.testing.assert_array_equal(tifffile.imread(tmp_path / "a.tif"), wanted.astype(np.float32))
+    hardware.Table.of(KINDS["polynomial"], linearise=(500, 3000)).save(table)
+    assert run("convert", table, tmp_path / "b.bin")[0] == 0
+    assert differences(*map(equipix.load, (table, tmp_path / "b.bin"))) == []
+    for source, target, option, words in (
+        (
+            path,
+            "b.nxs",
+            "gain",
+            "b.nxs: a NeXus file holds a flat to divide by, expected --as flat",
+        ),
+        (path, "b.npz", "flat", "holds no copy for other programs: leave out --as and --mean-one"),
+        (table, "c.bin", "flat", "a.hex: holds no map for --as or --mean-one: leave them out"),
+    ):
+        status, _, said = run("convert", source, tmp_path / target, "--as", option)
+        assert status == 1
+        assert words in said
+        assert not (tmp_path / target).exists()
+
+
+TYPES = st.sampled_from(["u1", "u2", "u4", "u8", "i2", "i4", "i8", "f4", "f8"])
+IMAGES = TYPES.flatmap(
+    lambda dtype: arrays(dtype, array_shapes(min_dims=2, max_dims=3, min_side=1, max_side=4))
+)
+TEXTS = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=20)
+JSON = st.dictionaries(TEXTS, st.integers() | st.floats(allow_nan=False) | TEXTS | st.none())
+NAMES = st.from_regex(r"[a-z][a-z_0-9.]{0,9}[a-z]", fullmatch=True)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@settings(max_examples=30, deadline=None)
+@given(pages=st.dictionaries(NAMES, IMAGES, min_size=1, max_size=4), text=JSON, shown=st.booleans())
+def test_any_arrays_and_any_text_come_back(tmp_path_factory, suffix, pages, text, shown):
+    path = tmp_path_factory.mktemp("any") / f"a{suffix}"
+    viewed = KINDS["response"].viewed() if shown else None
+    save_pages(path, pages, text, viewed)
+    found, metadata = load_pages(path)
+    assert metadata == text
+    assert found.keys() == pages.keys()
+    assert differences(pages, found) == []
 
 
 def test_all_records_are_tested():
@@ -317,7 +544,8 @@ def test_a_reader_of_one_kind_refuses_the_others(tmp_path):
     with pytest.raises(FileError, match=r"a\.tif: holds frame statistics, expected calibration th"):
         read_record(tmp_path / "a.tif", equipix.Calibration)
     with pytest.raises(
-        InputError, match=r"expected the suffix \.tif, \.tiff, \.npz, \.bin, \.hex or \.h"
+        InputError,
+        match=r"expected the suffix \.tif, \.npz, \.fits, \.nxs, \.asdf, \.bin, \.hex or \.h",
     ):
         equipix.load(tmp_path / "a.txt")
 

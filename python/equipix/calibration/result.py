@@ -285,7 +285,7 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
 
     def viewed(self) -> Viewed:
         """Return the sensitivity with its standard deviation, as other programs show them."""
-        return Viewed.of(self.sensitivity, self.flags, self.sensitivity_std)
+        return Viewed.of("flat", self.sensitivity, self.flags, self.sensitivity_std)
 
     @property
     def tilt(self) -> NDArray[Any]:

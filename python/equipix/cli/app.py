@@ -26,6 +26,7 @@ COMMANDS = {
     "compare": ("calibrate", "Show how far calibrations of one sensor agree."),
     "report": ("report", "Write results as one page, judged by limits."),
     "emva": ("emva", "Figures of a camera after EMVA 1288, and a page of them."),
+    "convert": ("report", "Write a result in another format, for other programs."),
     "average": ("frames", "Mean and variance of every pixel over many frames."),
     "correct": ("frames", "Correct frames by a calibration or by response curves."),
     "nuc": ("nuc", "Uniform source: fit response curves, find bad pixels, measure quality."),

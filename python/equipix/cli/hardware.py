@@ -2,7 +2,7 @@
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -11,7 +11,7 @@ from equipix.cli import terminal
 from equipix.correction.protocol import Correction, check_sensor
 from equipix.findings import Findings, usable
 from equipix.hardware.quality import quality, smallest_widths
-from equipix.hardware.table import SUFFIXES, Table
+from equipix.hardware.table import IMAGES, SUFFIXES, UPLOAD, Table
 from equipix.hardware.words import STEPS
 from equipix.saved_results import READ, load_correction
 
@@ -26,8 +26,8 @@ commands = typer.Typer()
 )
 @terminal.options_of(
     Table.of,
-    adc_bits="Bits of the ADC, 8 to 16.",
-    dac_bits="Bits of the coarse offset, 8 to 16.",
+    adc_bits="Bits of the ADC, 8 to 16; those of the sensor.",
+    dac_bits="Bits of the coarse offset, 8 to 16; 0 without a DAC.",
     offset_bits="Bits of the fine offset, 8 to 16.",
     gain_bits="Bits of the gain, 8 to 16.",
     out_bits="Bits of the output, 8 to 16.",
@@ -42,12 +42,22 @@ commands = typer.Typer()
 def hardware(
     result: Annotated[Path, typer.Argument(help=f"A correction: {READ}.")],
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="Table: .bin, .hex ($readmemh) or .h (C).")
+        Path,
+        typer.Option(
+            "--output", "-o", help="Table: .bin, .hex ($readmemh) or .h (C); .tif: gains alone."
+        ),
     ],
     frames: Annotated[
         list[str] | None,
         typer.Option(
             help="Raw frames of one steady even level: show the cost in C, and sufficient widths."
+        ),
+    ] = None,
+    preset: Annotated[
+        Literal["upload"] | None,
+        typer.Option(
+            help="upload: gains in steps of 1/1024 below 4 and no DAC, for a camera's own "
+            "flat-field correction."
         ),
     ] = None,
     sensor: terminal.Sensor = None,
@@ -56,9 +66,11 @@ def hardware(
     **options: Any,
 ) -> None:
     """Write a correction as words for a camera's electronics."""
-    terminal.check_output(output, [result], force=force, suffixes=SUFFIXES)
+    terminal.check_output(output, [result], force=force, suffixes=(*SUFFIXES, *IMAGES))
     correction = load_correction(result)
     check_sensor(correction, sensor)
+    if preset:
+        options |= UPLOAD
     table = Table.of(correction, **options)
     cost, said = _cost(correction, frames, options) if frames else ({}, ())
     table.save(output, force=force)

@@ -1,16 +1,20 @@
-"""The command report: results as one page, judged by limits."""
+"""Commands that pass results on: report, convert."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from equipix.cli import terminal
 from equipix.errors import EquipixError, InputError
+from equipix.hardware.table import Table
+from equipix.io.formats import SUFFIXES
 from equipix.io.paths import write_whole
+from equipix.io.viewed import Use
 from equipix.report.limits import limits_template, read_limits
 from equipix.report.page import page, part_of
 from equipix.saved_results import load
+from equipix.scene.scene_correction import SceneCorrection
 
 commands = typer.Typer()
 
@@ -60,3 +64,31 @@ def report(
 def _write(path: Path, text: str, *, force: bool) -> None:
     with write_whole(path, force=force) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+@commands.command(epilog="Example: equipix convert cal.tif cal.fits --as flat --mean-one")
+def convert(
+    result: Annotated[Path, typer.Argument(help="A result that equipix has saved.")],
+    output: Annotated[
+        Path, typer.Argument(help=f"The same result; its suffix is one of {', '.join(SUFFIXES)}.")
+    ],
+    use: Annotated[
+        Use | None,
+        typer.Option(
+            "--as", help="A flat to divide by, or a gain to multiply by; what the result is."
+        ),
+    ] = None,
+    mean_one: Annotated[
+        bool, typer.Option("--mean-one", help="Scale that map to mean 1 over usable pixels.")
+    ] = False,
+    force: terminal.Force = False,
+    as_json: terminal.Json = False,
+) -> None:
+    """Write a result in another format, for other programs."""
+    terminal.check_output(output, [result], force=force)
+    content = load(result)
+    options: dict[str, Any] = {"use": use, "mean_one": mean_one} if use or mean_one else {}
+    if options and isinstance(content, Table | SceneCorrection):
+        raise InputError(f"{result}: holds no map for 'use' or 'mean_one': leave them out")
+    content.save(output, force=force, **options)
+    terminal.show_result({"output": str(output)}, as_json=as_json)

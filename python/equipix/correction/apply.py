@@ -133,10 +133,8 @@ class CorrectionBase(Shown, ReadOnly):
         return Colours.of(sensor_table(self.metadata).get("cfa"))
 
     def viewed(self: Correction) -> Viewed:
-        """Return the gain, or the offset without one, as other programs show it of a file."""
-        planes = self.coefficients
-        image = planes[min(1, len(planes) - 1)]
-        return Viewed.of(image, self.flags, nothing=float(len(planes) > 1))
+        """Return the gain, as other programs show it of a file."""
+        return Viewed.of("gain", self.coefficients[1], self.flags)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the prepared coefficients, which cannot be pickled."""

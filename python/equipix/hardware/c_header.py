@@ -9,7 +9,7 @@ import numpy as np
 
 from equipix._check import Array
 from equipix.errors import FileError
-from equipix.hardware.table_files import DTYPES, Content, header, made, read_header
+from equipix.hardware.table_files import Content, header, made, memories, read_header
 from equipix.hardware.words import STEPS, Format
 
 _FIRST = "/* equipix table: "
@@ -20,9 +20,8 @@ _A_LINE = 16
 """Words in a line."""
 
 _APPLY = """
-/* Output word z of pixel p for the word x of the ADC; (z + {upper}_ZERO) steps of the output are
-   the corrected value in DN. The DAC must have subtracted {lower}_coarse[p] steps
-   ahead of the ADC: a raw word of a camera without it is another number, and gives a wrong z.
+/* Output word z of pixel p = row * {upper}_COLS + col.
+   {words}
    Right shifts of negative numbers must be arithmetic. */
 static inline uint16_t {lower}_apply(uint16_t x, uint32_t p)
 {{
@@ -69,7 +68,7 @@ def _macros(content: Content, upper: str) -> list[str]:
 def _arrays(content: Content, lower: str) -> list[str]:
     """Words of all pixels, row by row."""
     lines = []
-    for name in DTYPES:
+    for name in memories(content.format):
         values = getattr(content, name)
         texts = [str(value) for value in values.ravel().tolist()]
         lines.append(f"static const {values.dtype.name}_t {lower}_{name}[{values.size}] = {{")
@@ -84,6 +83,7 @@ def _function(f: Format, lower: str) -> str:
     return _APPLY.format(
         lower=lower,
         upper=lower.upper(),
+        words="\n   ".join(f.words),
         product=product,
         offset=offset,
         rounding=_ROUNDING.format(bits=out, half=f"((int64_t)1 << {out - 1})") if out else "",
@@ -104,7 +104,8 @@ def from_c_header(path: Path, data: bytes) -> Content:
     fields = read_header(path, first.removesuffix(" */"), _FIRST)
     guard = re.findall(r"^#ifndef (\w+)_H\s*$", text, re.MULTILINE)[0]
     above, newline, last = text.rpartition("\n")
-    content = made(path, fields, {name: _words(text, name) for name in DTYPES})
+    names = memories(Format(**fields["format"]))
+    content = made(path, fields, {name: _words(text, name) for name in names})
     if last != _last(guard, above + newline):
         raise FileError(
             f"{path}: was edited, or its digest removed: the last line does not hold the SHA-256 "

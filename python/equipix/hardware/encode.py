@@ -198,6 +198,8 @@ def _refuse_extreme(words: Words, gain: Floats, used: Bools) -> None:
 
 def _coarse(pedestal: Floats, bits: int, steps: Steps, lowest: float) -> tuple[Floats, int]:
     """Words of the DAC: at most what the pixel gives at the lowest corrected value."""
+    if bits == 0:
+        return np.zeros(pedestal.shape), steps.adc
     words = Words("dac", bits, floor=True)
     values = np.maximum(pedestal, 0)
     if steps.coarse is not None and words.outside(values, steps.coarse) == values.size:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -16,15 +16,29 @@ from equipix.findings import Finding, say, usable
 from equipix.hardware import c_header, table_files
 from equipix.hardware.encode import Steps, encode, line_of, origin, refuse_far_offsets
 from equipix.hardware.table_files import Content
-from equipix.hardware.words import WIDTHS, check_width, chosen_exponent, exponent_of
+from equipix.hardware.words import (
+    NARROWEST,
+    WIDEST,
+    WIDTHS,
+    check_width,
+    chosen_exponent,
+    exponent_of,
+)
+from equipix.io import tiff
 from equipix.io.paths import as_path, reading, write_whole
 from equipix.measured.colour import Colours
+
+_ADC_BITS = 14
+"""Bits of the ADC where those of the sensor are unknown."""
 
 _COARSE = 0.005
 """Largest error of words, over the range of the ADC."""
 
 _KEPT = 0.99
 """Least share of the raw values that the ADC must hold."""
+
+UPLOAD: dict[str, Any] = {"dac_bits": 0, "gain_bits": 12, "gain_step": 2.0**-10}
+"""Gains as cameras take them for their own flat-field correction: steps of 1/1024, below 4."""
 
 
 class Applied(NamedTuple):
@@ -100,7 +114,7 @@ class Table(RawCorrection, Content):
         cls,
         correction: Correction,
         *,
-        adc_bits: int = 14,
+        adc_bits: int | None = None,
         dac_bits: int = 8,
         offset_bits: int = 12,
         gain_bits: int = 16,
@@ -120,8 +134,12 @@ class Table(RawCorrection, Content):
         correction : Correction
             A calibration, a response of order up to 1, or any other with offset and gain. Pixels
             flagged ``DO_NOT_USE`` or NaN get words of 0.
-        adc_bits, dac_bits, offset_bits, gain_bits, out_bits : int
-            Widths of the words, 8 to 16.
+        adc_bits : int, optional
+            Width of the words of the ADC, 8 to 16; the bits of the sensor unless given, 14 where
+            they are unknown.
+        dac_bits, offset_bits, gain_bits, out_bits : int
+            Widths of the other words, 8 to 16. Without a DAC `dac_bits` is 0: the ADC then sees raw
+            values, and there is no coarse memory.
         adc_step, out_step : float
             DN of the correction in a step of the ADC and of the output, powers of two. Unless
             given, the output has the range of the ADC.
@@ -159,6 +177,10 @@ class Table(RawCorrection, Content):
             the raw values of the sensor's bit depth, where the metadata have that.
         """
         check_correction("correction", correction)
+        if adc_bits is None:
+            adc_bits = min(max(correction.bits or _ADC_BITS, NARROWEST), WIDEST)
+        if dac_bits == 0 and dac_step is not None:
+            raise InputError(f"'dac_step' is {dac_step!r}, but 'dac_bits' is 0: leave it out")
         bits = zip(WIDTHS, (adc_bits, dac_bits, offset_bits, gain_bits, out_bits), strict=True)
         widths = {name: check_width(name, width) for name, width in bits}
         if not np.isfinite(number("lowest", lowest)):
@@ -297,7 +319,9 @@ class Table(RawCorrection, Content):
         Parameters
         ----------
         path : str or path
-            The file; its suffix names the format: .bin, .hex (for ``$readmemh``) or .h (C).
+            The file; its suffix names the format: .bin, .hex (for ``$readmemh``) or .h (C); or
+            .tif, which holds the gain words alone, as an image of 16 bits for the flat-field upload
+            of a camera, and is not read back.
         force : bool
             Whether an existing file may be replaced.
 
@@ -309,6 +333,11 @@ class Table(RawCorrection, Content):
             If the suffix is another.
         """
         file = as_path("path", path)
+        if file.suffix.lower() in IMAGES:
+            text = "\n".join(self.format.words)
+            with write_whole(path, force=force) as temporary:
+                tiff.write_frames(temporary, [self.gain], nbytes=0, description=text)
+            return
         encode_file, _ = _FORMATS[_suffix(file)]
         data = encode_file(self, file.stem)
         with write_whole(path, force=force) as temporary:
@@ -342,6 +371,9 @@ _FORMATS = {
 
 SUFFIXES = tuple(_FORMATS)
 """Suffixes of files of tables."""
+
+IMAGES = (".tif", ".tiff")
+"""Suffixes of files of gain words alone."""
 
 
 def read_table(path: str | PathLike[str]) -> Table:

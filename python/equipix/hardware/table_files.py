@@ -3,13 +3,13 @@
 Binary files are the memories one behind the other, for a loader.
 All numbers are little-endian. After the magic ``EQXT`` come the length of the header, a 32-bit
 number, and the header itself, one line of JSON padded with spaces; then the words of the coarse
-offset, the fine offset and the gain, row by row, as one byte each where the width is 8 bits, else
-two; then the flags, four bytes a pixel. Each of these four memories starts at a multiple of 16
-bytes, so that a loader can map it; zeros fill the gaps.
+offset, if there is a DAC, the fine offset and the gain, row by row, as one byte each where the
+width is 8 bits, else two; then the flags, four bytes a pixel. Each of these memories starts at a
+multiple of 16 bytes, so that a loader can map it; zeros fill the gaps.
 
 Memory images are text for ``$readmemh``, one word a pixel. From the highest bit down a word is the
 coarse offset, the fine offset in two's complement, and the gain; the address is row · cols + col.
-Flags of a pixel follow its word as a comment.
+Comments at the top state the formula. Flags of a pixel follow its word as a comment.
 """
 
 import json
@@ -130,6 +130,8 @@ def made(path: Path, told: dict[str, Any], arrays: dict[str, Array]) -> Content:
         If they do not fit together.
     """
     shape = (int(told["rows"]), int(told["cols"]))
+    if told["format"]["dac_bits"] == 0:
+        arrays = {"coarse": np.zeros(shape, np.uint16), **arrays}
     for name, values in arrays.items():
         if values.size != shape[0] * shape[1]:
             raise FileError(
@@ -192,11 +194,16 @@ def _aligned(size: int) -> int:
     return -(-size // _ALIGNED) * _ALIGNED
 
 
+def memories(widths: Format) -> list[str]:
+    """Names of the arrays that a file holds: without a DAC there are no coarse words."""
+    return [name for name in DTYPES if name != "coarse" or widths.dac_bits]
+
+
 def _stored(widths: Format) -> dict[str, np.dtype[np.generic]]:
     """Type of each array in the file."""
     found = {}
-    for name, dtype in DTYPES.items():
-        full = np.dtype(dtype)
+    for name in memories(widths):
+        full = np.dtype(DTYPES[name])
         narrow = widths.stored.get(name, 32) <= 8
         found[name] = np.dtype(f"{full.kind}1") if narrow else full.newbyteorder("<")
     return found
@@ -212,7 +219,7 @@ def to_memory_image(content: Content, _name: str) -> bytes:
     packed = (content.coarse.astype(np.int64) << f.offset_bits | offset) << f.gain_bits
     packed |= content.gain
     digits = -(-sum(f.stored.values()) // 4)
-    lines = [f"{_FIRST}{header(content)}", f"// {_fields(f)}"]
+    lines = [f"{_FIRST}{header(content)}", *(f"// {line}" for line in (*f.words, _fields(f)))]
     for word, flags in zip(packed.flat, content.flags.flat, strict=True):
         lines.append(f"{word:0{digits}x}" + (f" // {flags:08x}" if flags else ""))
     return "\n".join([*lines, ""]).encode()
@@ -240,4 +247,5 @@ def _fields(f: Format) -> str:
     """Where the fields of a word are."""
     gain, offset = f.gain_bits, f.gain_bits + f.offset_bits
     top = offset + f.dac_bits - 1
-    return f"coarse [{top}:{offset}], offset [{offset - 1}:{gain}], gain [{gain - 1}:0]"
+    coarse = f"coarse [{top}:{offset}], " if f.dac_bits else ""
+    return f"bits: {coarse}offset [{offset - 1}:{gain}], gain [{gain - 1}:0]"

@@ -10,7 +10,7 @@ import numpy as np
 from equipix._check import Floats, is_whole, number
 from equipix.errors import InputError
 
-_NARROWEST, WIDEST = 8, 16
+NARROWEST, WIDEST = 8, 16
 """Widths of words, in bits."""
 
 WIDTHS = ("adc_bits", "dac_bits", "offset_bits", "gain_bits", "out_bits")
@@ -33,7 +33,8 @@ class Format:
     Attributes
     ----------
     adc_bits, dac_bits, offset_bits, gain_bits, out_bits : int
-        Widths, 8 to 16. The words of the offset are signed, in two's complement.
+        Widths, 8 to 16; of the DAC also 0, where there is none. The words of the offset are signed,
+        in two's complement.
     adc, coarse, offset, out : int
         One step is 2 to this power, in DN of the correction.
     gain : int
@@ -95,6 +96,27 @@ class Format:
         return self.gain + self.adc - lowest, self.offset - lowest, self.out - lowest
 
     @property
+    def words(self) -> tuple[str, ...]:
+        """What the words stand for, and the formula, line by line."""
+        ahead = (
+            f"after the DAC has subtracted coarse * 2^{self.coarse} DN from the raw value"
+            if self.dac_bits
+            else "of the raw value: no DAC subtracts anything ahead of the ADC"
+        )
+        dac = f"coarse: {self.dac_bits} bits, unsigned. " if self.dac_bits else ""
+        return (
+            f"x: word of the ADC, {self.adc_bits} bits, unsigned, in steps of 2^{self.adc} DN,",
+            f"   {ahead}.",
+            f"z = {self.base} + round((gain * x * 2^{self.gain + self.adc} + offset * "
+            f"2^{self.offset}) / 2^{self.out}),",
+            f"   rounded half to even, limited to 0 to {2**self.out_bits - 1}.",
+            f"corrected value in DN: (z + {self.zero}) * 2^{self.out}",
+            f"{dac}offset: {self.offset_bits} bits, two's complement.",
+            f"gain: {self.gain_bits} bits, unsigned, in steps of 2^{self.gain}.",
+            "gain 0: do not use this pixel; its z is 0.",
+        )
+
+    @property
     def largest_word(self) -> int:
         """Largest word of the ADC."""
         return int(2**self.adc_bits - 1)
@@ -102,8 +124,9 @@ class Format:
 
 def check_width(name: str, bits: object) -> int:
     """Refuse a width out of range."""
-    if not is_whole(bits, _NARROWEST, WIDEST):
-        raise InputError(f"'{name}' is {bits!r}, expected {_NARROWEST} to {WIDEST} bits")
+    without = " or 0" if name == "dac_bits" else ""
+    if not is_whole(bits, NARROWEST, WIDEST) and not (without and is_whole(bits, 0, 0)):
+        raise InputError(f"'{name}' is {bits!r}, expected {NARROWEST} to {WIDEST}{without} bits")
     return int(bits)  # type: ignore[call-overload, no-any-return]
 
 

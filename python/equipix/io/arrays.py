@@ -89,12 +89,18 @@ def _npy(file: Path, _: str) -> Iterator[Any]:
     yield np.load(file, mmap_mode="r", allow_pickle=False)
 
 
-@contextmanager
-def _hdf5(file: Path, place: str) -> Iterator[Any]:
+def hdf5_library() -> Any:
+    """Import the library of HDF5 files."""
     try:
         import h5py
     except ImportError as error:
-        raise _missing("HDF5", "h5py", "hdf5") from error
+        raise missing("HDF5", "h5py", "hdf5") from error
+    return h5py
+
+
+@contextmanager
+def _hdf5(file: Path, place: str) -> Iterator[Any]:
+    h5py = hdf5_library()
     with h5py.File(file) as root:
         arrays: list[str] = []
 
@@ -121,7 +127,7 @@ def _zarr(file: Path, place: str) -> Iterator[Any]:
     try:
         import zarr
     except ImportError as error:
-        raise _missing("Zarr", "zarr", "zarr") from error
+        raise missing("Zarr", "zarr", "zarr") from error
     root = zarr.open(str(file), mode="r")
     if isinstance(root, zarr.Array):
         yield root
@@ -144,7 +150,8 @@ def _chosen(
     raise FileError(f"{file}: {wrong}holds {listed}{more}: name one, as in {file}:/entry/data")
 
 
-def _missing(what: str, library: str, extra: str) -> EquipixError:
+def missing(what: str, library: str, extra: str) -> EquipixError:
+    """Return an error that names a library, and what installs it."""
     return EquipixError(
         f"{what} files need {library}, which is not installed: pip install 'equipix[{extra}]'"
     )

@@ -19,6 +19,8 @@ SUFFIXES = (".fits", ".fit", ".fts")
 
 _NAME, _TEXT = "ARRAY", "EQUIPIX-METADATA"
 
+_USES = {"flat": "divide frames by it", "gain": "multiply frames by it"}
+
 _KINDS = {8: "u1", 16: "i2", 32: "i4", 64: "i8", -32: "f4", -64: "f8"}
 """Types of the values by the keyword BITPIX."""
 
@@ -41,6 +43,7 @@ def write_pages(
     fits = _astropy()
     units = [fits.PrimaryHDU() if viewed is None else fits.PrimaryHDU(viewed.image)]
     if viewed is not None:
+        units[0].header["MAP"] = (viewed.name, _USES.get(viewed.kind, ""))
         units[0].header["BUNIT"] = (viewed.unit or "1", "1: a ratio")
         if viewed.std is not None:
             uncertainty = fits.ImageHDU(viewed.std, name="UNCERT")
@@ -58,6 +61,15 @@ def write_pages(
         unit.add_checksum(when="HDU checksum")  # not the time: the same result, the same file
     with path.open("wb") as file:
         every.writeto(file)
+
+
+def ccddata(viewed: Viewed) -> Any:
+    """Return a map as astropy's ``CCDData``."""
+    _astropy()  # names what is missing
+    from astropy.nddata import CCDData, StdDevUncertainty
+
+    std = None if viewed.std is None else StdDevUncertainty(viewed.std)
+    return CCDData(viewed.image, unit=viewed.unit, mask=viewed.mask, uncertainty=std)
 
 
 def read_pages(path: Path) -> tuple[dict[str, NDArray[Any]], str]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from equipix._check import Array, Bools
 from equipix.errors import FileError, InputError
-from equipix.io import fits, tiff
+from equipix.io import arrays, asdf, fits, nexus, tiff
 from equipix.io.frames import Header, frame_format, header, read_frames, suffix_of
 from equipix.io.paths import as_path, reading, write_whole
 from equipix.io.viewed import Viewed
@@ -41,7 +41,7 @@ def _read_npz(path: Path) -> _Content:
     return pages, str(pages.pop(_TEXT, ""))
 
 
-def _npz_text(path: Path) -> str:
+def _npz_description(path: Path) -> str:
     with path.open("rb") as stream, np.lib.npyio.NpzFile(stream) as file:
         return str(file.get(_TEXT, ""))
 
@@ -50,10 +50,23 @@ _FORMATS = {
     **dict.fromkeys((".tif", ".tiff"), (tiff.write_pages, tiff.read_pages)),
     ".npz": (_write_npz, _read_npz),
     **dict.fromkeys(fits.SUFFIXES, (fits.write_pages, fits.read_pages)),
+    **dict.fromkeys(nexus.SUFFIXES, (nexus.write_pages, nexus.read_pages)),
+    **dict.fromkeys(asdf.SUFFIXES, (asdf.write_pages, asdf.read_pages)),
 }
 """What writes and reads arrays and a text in each format; of other files there is no text."""
 
+_DESCRIPTIONS = {
+    ".npz": _npz_description,
+    **dict.fromkeys(fits.SUFFIXES, fits.description),
+    **dict.fromkeys(nexus.SUFFIXES, nexus.description),
+    **dict.fromkeys(asdf.SUFFIXES, asdf.description),
+}
+"""What reads the text alone; that of a TIFF is the first page's description."""
+
 SUFFIXES = tuple(_FORMATS)
+
+ONLY_RESULTS = (".npz", *asdf.SUFFIXES)
+"""Suffixes of files that hold results and no frames."""
 
 
 def save_pages(
@@ -69,7 +82,7 @@ def save_pages(
     Parameters
     ----------
     path : path
-        Output; its suffix names the format: .tif, .npz or .fits.
+        Output; its suffix names the format: .tif, .npz, .fits, .nxs or .asdf.
     pages : mapping of str to ndarray
         Arrays by name, each kept in its own dtype: of shape (rows, cols), or a stack of shape
         (n, rows, cols), whose images are pages of their own in a TIFF.
@@ -100,7 +113,7 @@ def load_pages(path: str | PathLike[str]) -> tuple[dict[str, Array], dict[str, A
     Parameters
     ----------
     path : path
-        A .tif, .npz or .fits file.
+        A .tif, .npz, .fits, .nxs or .asdf file.
 
     Returns
     -------
@@ -137,9 +150,20 @@ def load_pages(path: str | PathLike[str]) -> tuple[dict[str, Array], dict[str, A
 def _format(path: Path) -> tuple[Callable[..., None], Callable[[Path], _Content]]:
     if path.suffix.lower() not in _FORMATS:
         raise InputError(
-            f"{path}: ends in '{path.suffix}', expected the suffix .tif, .npz or .fits"
+            f"{path}: ends in '{path.suffix}', expected the suffix .tif, .npz, .fits, .nxs or .asdf"
         )
     return _FORMATS[path.suffix.lower()]
+
+
+def refuse_copy(path: str | PathLike[str], use: str | None) -> None:
+    """Refuse a copy for other programs that a format does not hold."""
+    suffix = as_path("path", path).suffix.lower()
+    if suffix == ".npz":
+        raise InputError(
+            f"{path}: an .npz file holds no copy for other programs: leave out 'use' and 'mean_one'"
+        )
+    if suffix in nexus.SUFFIXES and use == "gain":
+        raise InputError(f"{path}: a NeXus file holds a flat to divide by, expected 'use' flat")
 
 
 def _checksum(metadata: Mapping[str, Any]) -> int:
@@ -161,9 +185,10 @@ def saved_kind(path: Path) -> str | None:
     Files of whole numbers, which cameras write, are not searched.
     """
     suffix = suffix_of(path)
-    if suffix == ".npz" or suffix in fits.SUFFIXES:
-        with reading(path):
-            return _kind(_npz_text(path) if suffix == ".npz" else fits.description(path))
+    if suffix in _DESCRIPTIONS:
+        file, _ = arrays.split(path)
+        with reading(file):
+            return _kind(_DESCRIPTIONS[suffix](file))
     is_searched = suffix in SUFFIXES and frame_format(path)[1].kind == "f"
     return _kind(header(path).description) if is_searched else None
 
@@ -201,7 +226,7 @@ def raw_headers(files: Iterable[Path], shape: tuple[int, int]) -> dict[Path, Hea
 
 def raw_header(path: Path) -> Header:
     """Shape, dtype and text of raw frames; what `save_pages` wrote is refused like there."""
-    if suffix_of(path) in (".npz", *fits.SUFFIXES):
+    if suffix_of(path) in _DESCRIPTIONS:
         refuse_saved(path)
     found = header(path)
     _refuse_kind(path, _kind(found.description) if found.dtype.kind == "f" else None)

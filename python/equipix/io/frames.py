@@ -1,7 +1,7 @@
 """Frames and masks from image files, by whichever reader decodes them."""
 
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -114,11 +114,20 @@ def frame_format(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any]]:
     if not is_image(path):
         return header(path)[:2]
     check_image(path)
-    try:
+    with leaving_others(path):
         count, rows, cols, bits = _native.file_format(path)
-    except UnsupportedFileError:
-        return tiff.header(path)[:2]
-    return (count, rows, cols), np.dtype(f"uint{bits}")
+        return (count, rows, cols), np.dtype(f"uint{bits}")
+    return tiff.header(path)[:2]
+
+
+@contextmanager
+def leaving_others(*paths: Path) -> Iterator[None]:
+    """Leave to tifffile what the compiled reader does not decode, saved results among it."""
+    try:
+        yield
+    except FileError as error:
+        if not isinstance(error, UnsupportedFileError) and not any(map(tiff.is_result, paths)):
+            raise
 
 
 def check_image(path: Path) -> None:
@@ -175,7 +184,7 @@ def _frames(path: Path, workers: int | None) -> Iterator[NDArray[Any]]:
             yield from _reader(path).stream_frames(path)
         return
     check_image(path)
-    with suppress(UnsupportedFileError):
+    with leaving_others(path):
         count, rows, cols, bits = _native.file_format(path)
         if count == 1 or count * rows * cols * bits <= 8 * _AT_ONCE:
             yield _native.read_file(path, workers)

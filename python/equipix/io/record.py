@@ -34,8 +34,8 @@ import numpy as np
 from equipix._check import Array, Floats, ReadOnly
 from equipix._native import __version__
 from equipix.errors import FileError, InputError
-from equipix.io.formats import load_pages, save_pages
-from equipix.io.viewed import Viewed
+from equipix.io.formats import load_pages, refuse_copy, save_pages
+from equipix.io.viewed import Use
 from equipix.shown import Shown
 
 Map = Annotated[Array, "float32|float64", "rows cols"]
@@ -79,15 +79,28 @@ class Record(Shown, ReadOnly):
         """Name the kind in the metadata of a file, and the version of its content."""
         cls.KIND, cls.VERSION = kind, version
 
-    def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
+    def save(
+        self,
+        path: str | PathLike[str],
+        *,
+        use: Use | None = None,
+        mean_one: bool = False,
+        force: bool = False,
+    ) -> None:
         """Write to a file that `equipix.load` reads.
 
         Parameters
         ----------
         path : str or path
-            The file; its suffix, .tif, .npz or .fits, names the format. It appears whole or not at
-            all. Other programs show a copy of the sensitivity, the gain or the mean: the first page
-            of a TIFF, in single precision, and the primary image of a FITS file.
+            The file; its suffix, .tif, .npz, .fits, .nxs or .asdf, names the format. It appears
+            whole or not at all. Other programs show a copy of the sensitivity, the gain or the
+            mean: the page of a TIFF, in single precision, the primary image of a FITS file, the
+            flat field of a NeXus file.
+        use : {"flat", "gain"}, optional
+            Whether that copy is a flat to divide frames by, or a gain to multiply them by; what the
+            result is unless given, and a flat in NeXus. `equipix.load` reads the same result.
+        mean_one : bool
+            Whether that copy is scaled to mean 1 over the usable pixels.
         force : bool
             Whether an existing file may be replaced.
 
@@ -96,8 +109,12 @@ class Record(Shown, ReadOnly):
         FileError
             If the file exists and `force` is not set, or it cannot be written.
         InputError
-            If the suffix is unknown, or a value has not the type or shape that files hold.
+            If the suffix is unknown, a value has not the type or shape that files hold, or there is
+            no such copy.
         """
+        viewed = self._exported(use, mean_one) if use or mean_one else self.viewed()
+        if use or mean_one:
+            refuse_copy(path, use)
         held = _Arrays({})
         try:
             fields = _encoded(self, type(self), "", held)
@@ -106,11 +123,7 @@ class Record(Shown, ReadOnly):
             raise InputError(f"this {self.KIND} cannot be saved: {error}") from error
         content = {"kind": self.KIND, "version": self.VERSION, "equipix": __version__}
         metadata = content | {"fields": fields}
-        save_pages(path, held.by_name, metadata, self.viewed(), force=force)
-
-    def viewed(self) -> Viewed | None:
-        """Return what other programs show of a file; None without a map that is meant for them."""
-        return None
+        save_pages(path, held.by_name, metadata, viewed, force=force)
 
 
 Kind = TypeVar("Kind", bound=Record)

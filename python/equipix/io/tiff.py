@@ -4,6 +4,7 @@ The only module that imports tifffile.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -73,7 +74,8 @@ def stream_frames(path: Path) -> Iterator[NDArray[Any]]:
 def _check_page(path: Path, page: Any, length: int) -> None:
     """Refuse what the compiled reader refuses: colour, white at 0, and pages that are no frames."""
     old_type = page.tags.valueof(_SUBFILE_TYPE, default=1)
-    if page.is_reduced or page.is_mask or page.subifds or old_type == 2:
+    beside = page.subifds and not _is_view(page)
+    if page.is_reduced or page.is_mask or beside or old_type == 2:
         raise FileError(
             f"{path}: holds a reduced copy or a mask beside its frames, expected frames only:"
             " export them to a file of their own"
@@ -147,13 +149,16 @@ def write_pages(
 ) -> None:
     """Write named arrays as pages, with a description of the first.
 
-    The first page is what other programs show of the result, in single precision.
+    What other programs show of the result is the only page of the file, in single precision: the
+    others are its SubIFDs, since ImageJ refuses a file with a page of 64 bits.
 
     The images of a stack have the stack's name and are numbered; a single image has no number.
     Arrays of other sizes than the first one's are the last pages: tifffile takes all pages for
     equal where a few at the beginning and the last are.
     """
+    behind = 0
     if viewed is not None:
+        behind = sum(1 if array.ndim == 2 else len(array) for array in pages.values())
         pages = {_VIEW: viewed.image.astype(np.float32), **pages}
     sizes = [array.shape[-2:] for array in pages.values()]
     ordered = sorted(pages.items(), key=lambda each: each[1].shape[-2:] != sizes[0])
@@ -169,15 +174,16 @@ def write_pages(
                     photometric="minisblack",
                     metadata=None,
                     description=description,
+                    subifds=behind,
                     extratags=[named] if array.ndim == 2 else [named, numbered],
                 )
-                description = ""
+                description, behind = "", 0
 
 
 def read_pages(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
     """Read what `write_pages` wrote: arrays by name, and the description; of other files none."""
     with tifffile.TiffFile(path) as file:
-        every: Sequence[Any] = file.pages
+        every: Sequence[Any] = [*file.pages, *(file.pages[0].pages or ())]
         if any(_PAGE_NAME not in page.tags for page in every):
             return {}, ""
         images: dict[str, list[Any]] = {}
@@ -186,6 +192,17 @@ def read_pages(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
         images.pop(_VIEW, None)
         pages = {name: _image_or_stack(path, name, found) for name, found in images.items()}
         return pages, every[0].description
+
+
+def is_result(path: Path) -> bool:
+    """Whether the file is a result with a page for other programs."""
+    with suppress(FileError), reading(path), tifffile.TiffFile(path) as file:
+        return _is_view(file.pages[0])
+    return False
+
+
+def _is_view(page: Any) -> bool:
+    return bool(page.tags.valueof(_PAGE_NAME) == _VIEW)
 
 
 def _image_or_stack(path: Path, name: str, images: Sequence[Any]) -> NDArray[Any]:

@@ -5,7 +5,6 @@ import itertools
 import operator
 import os
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,8 +22,15 @@ from equipix._check import (
     naming_memory,
     positive_workers,
 )
-from equipix.errors import FileError, InputError, UnsupportedFileError
-from equipix.io.frames import check_image, frame_format, is_image, stream_frames
+from equipix.errors import FileError, InputError
+from equipix.io.formats import ONLY_RESULTS
+from equipix.io.frames import (
+    check_image,
+    frame_format,
+    is_image,
+    leaving_others,
+    stream_frames,
+)
 from equipix.io.paths import find_files
 from equipix.io.record import made, now, read_record
 from equipix.measured.saturation import level_of
@@ -167,12 +173,12 @@ def _paths_or_frames(source: Any) -> list[Any] | Array | Iterator[Any]:
 
 def _average_files(names: list[Any], how: _How) -> FrameStatistics:
     paths = find_files(names)
-    if any(path.suffix.lower() == ".npz" for path in paths):
+    if any(path.suffix.lower() in ONLY_RESULTS for path in paths):
         return _saved(paths, how)
     if how.rejection is None and all(map(is_image, paths)):
         for path in paths:
             check_image(path)
-        with suppress(UnsupportedFileError):
+        with leaving_others(*paths):
             shape, dtype = frame_format(paths[0])
             mask = as_mask(how.mask, shape[1:])
             maps = _native.average_files(paths, how.level, mask, how.workers, how.progress)

@@ -110,7 +110,7 @@ class FrameStatistics(Record, kind="frame statistics", version=3):
     def viewed(self) -> Viewed:
         """Return the mean with its standard deviation, as other programs show them."""
         flags, std = np.zeros(self.mean.shape, np.uint32), np.sqrt(self.variance_of_mean)
-        return dataclasses.replace(Viewed.of(self.mean, flags, std, nothing=0.0), unit="adu")
+        return Viewed.of("mean", self.mean, flags, std)
 
     @property
     def maps(self) -> dict[str, Array]:

@@ -317,7 +317,7 @@ class SceneCorrection(Shown):
         Parameters
         ----------
         path : str or path
-            The file; its suffix, .tif or .npz, names the format.
+            The file; its suffix, .tif, .npz, .fits, .nxs or .asdf, names the format.
         force : bool
             Whether an existing file may be replaced.
 
