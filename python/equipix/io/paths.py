@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from os import PathLike
 from pathlib import Path
 
-from equipix.errors import EquipixError, FileError, InputError, InsufficientMemoryError
+from equipix.errors import EquipixError, FileError, InputError
 from equipix.io.arrays import ZARR, split
 
 
@@ -114,11 +114,12 @@ def reading(path: Path) -> Iterator[None]:
     logger.addHandler(complaints)
     try:
         yield
-    except (FileError, InsufficientMemoryError):
-        raise
     except FileNotFoundError as error:
         raise FileError(f"{path}: does not exist") from error
     except Exception as error:
+        # Values out of range are a fault of the file; no memory, or no library, is not.
+        if isinstance(error, EquipixError) and not isinstance(error, InputError):
+            raise
         broken = f"incomplete, damaged, or no {path.suffix} file: use a copy, or make it again"
         codecs = f"{error}; pip install 'equipix[codecs]'" if "imagecodecs" in str(error) else ""
         why = codecs or getattr(error, "strerror", None) or broken

@@ -150,7 +150,8 @@ def write_pages(
     """Write named arrays as pages, with a description of the first.
 
     What other programs show of the result is the only page of the file, in single precision: the
-    others are its SubIFDs, since ImageJ refuses a file with a page of 64 bits.
+    others are its SubIFDs, since ImageJ refuses a file with a page of 64 bits. They are of another
+    photometric interpretation, DepthMap of DNG 1.5, since tifffile makes one stack of alike images.
 
     The images of a stack have the stack's name and are numbered; a single image has no number.
     Arrays of other sizes than the first one's are the last pages: tifffile takes all pages for
@@ -171,7 +172,7 @@ def write_pages(
                 numbered = (_PAGE_NUMBER, "H", 2, (number, len(array)), True)
                 file.write(
                     image,
-                    photometric="minisblack",
+                    photometric="depth_map" if viewed and name != _VIEW else "minisblack",
                     metadata=None,
                     description=description,
                     subifds=behind,
