@@ -86,6 +86,17 @@ class TestTruth:
             np.sqrt(0.24 / found.gain_dn_per_e**2 + 0.25) + 0.5
         )
 
+    def test_a_negative_estimate_of_dark_noise_counts_as_049_dn(self):
+        on, off, photons, times = camera_levels(3)
+        # The noise of the darks grows from 0 DN at a time above 0: at 0 a line is below 0.
+        rng, growth = np.random.default_rng(1), 40 * (times / times.max() - 0.5)
+        off = [100 + np.rint(max(each, 0.0) * rng.standard_normal((2, 48, 64))) for each in growth]
+        found = metrics.emva_transfer(on, off, photons, exposure_s=times)
+        assert found.dark_noise_dn < -1
+        least = np.sqrt(0.24 / found.gain_dn_per_e**2 + 0.25) + 0.5
+        assert found.threshold_e == pytest.approx(least)
+        assert found.snr(found.threshold_light) == pytest.approx(1)
+
     def test_without_three_exposure_times_there_is_no_dark_current(self):
         on, off, photons, times = camera_levels(4)
         for given in (None, np.full(len(times), 0.01), np.resize([0.01, 0.02], len(times))):
@@ -308,7 +319,7 @@ class TestDescriptor:
         (tmp_path / "empty").mkdir()
         status, _, told = run("emva", tmp_path / "empty")
         assert status == 1
-        assert "holds neither EMVA1288_Data.txt and camera.toml, expected one" in told
+        assert "holds neither EMVA1288_Data.txt nor camera.toml, expected one of them" in told
 
 
 @pytest.mark.parametrize(

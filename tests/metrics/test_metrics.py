@@ -348,6 +348,8 @@ class TestEmvaSpatial:
             metrics.emva_spatial(dark, dark)
         with pytest.raises(errors.InputError, match="'frames' are of"):
             metrics.emva_spatial(dark[:, :4], dark)
+        with pytest.raises(errors.InputError, match="two or more rows and columns, above 2 x 2"):
+            metrics.emva_spatial(dark[:, :2, :2] + 9, dark[:, :2, :2])
         with pytest.raises(errors.InputError, match="1 values that are not finite"):
             metrics.emva_spatial(np.where(dark == dark.max(), np.nan, dark + 9), dark)
         with pytest.raises(errors.InputError, match="'gain_dn_per_e' is 0"):

@@ -126,8 +126,11 @@ class CameraExperiment(Described[CameraManifest]):
         if file.is_dir():
             found = [file / name for name in (_DESCRIPTOR, "camera.toml") if (file / name).exists()]
             if len(found) != 1:
-                held = "both" if found else "neither"
-                raise FileError(f"{file}: holds {held} {_DESCRIPTOR} and camera.toml, expected one")
+                held, also = ("both", "and") if found else ("neither", "nor")
+                raise FileError(
+                    f"{file}: holds {held} {_DESCRIPTOR} {also} camera.toml, expected one of them: "
+                    "name the file"
+                )
             file = found[0]
         return super().load(file)
 

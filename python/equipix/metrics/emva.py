@@ -127,10 +127,11 @@ def emva_spatial(
     0.01
     """
     off, on = moments("dark", dark), moments("frames", frames)
-    if off.mean.shape != on.mean.shape or min(off.mean.shape) < 2:
+    rows, cols = off.mean.shape
+    if off.mean.shape != on.mean.shape or rows * cols <= rows + cols:
         raise InputError(
             f"'frames' are of {on.mean.shape}, 'dark' of {off.mean.shape}: expected one "
-            "shape of two or more rows and columns"
+            "shape of two or more rows and columns, above 2 x 2"
         )
     dark_mean, bright_mean = float(off.mean.mean()), float(on.mean.mean())
     signal = bright_mean - dark_mean
@@ -256,10 +257,14 @@ class EmvaTransfer:
         return self.responsivity / self.gain_dn_per_e * self.saturation_light
 
     @property
+    def _dark_variance(self) -> float:
+        """Variance without light that counts, in electrons."""
+        return max(self.dark_noise_dn * abs(self.dark_noise_dn), QUANTISED) / self.gain_dn_per_e**2
+
+    @property
     def threshold_e(self) -> float:
         """Absolute sensitivity threshold in electrons: the signal equals its noise."""
-        dark = max(self.dark_noise_dn**2, QUANTISED) / self.gain_dn_per_e**2
-        return float(np.sqrt(dark + 0.25) + 0.5)
+        return float(np.sqrt(self._dark_variance + 0.25) + 0.5)
 
     @property
     def threshold_light(self) -> float:
@@ -292,8 +297,7 @@ class EmvaTransfer:
             The ratio.
         """
         electrons = self.responsivity / self.gain_dn_per_e * np.asarray(light, np.float64)
-        dark = max(self.dark_noise_dn**2, QUANTISED) / self.gain_dn_per_e**2
-        noise = dark + dsnu_e**2 + electrons + (prnu * electrons) ** 2
+        noise = self._dark_variance + dsnu_e**2 + electrons + (prnu * electrons) ** 2
         return np.asarray(electrons / np.sqrt(noise))
 
 
