@@ -325,6 +325,9 @@ def test_gains_for_the_upload_of_a_camera(made, tmp_path, run):
     assert not gain[~used].any()
     with tifffile.TiffFile(tmp_path / "gain.tif") as file:
         assert "gain: 12 bits, unsigned, in steps of 2^-10." in file.pages[0].description
+    status, _, told = run(*command, tmp_path / "other.tif", "--gain-bits", "14")
+    assert status == 1
+    assert "--gain-bits is 14, but '--preset upload' has 12: leave one out" in told
     planes = np.array(response.coefficients)
     planes[1, 3, 4] = 4.5
     with pytest.raises(

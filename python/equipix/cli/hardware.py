@@ -1,6 +1,7 @@
 """The command that makes a table of words of a correction."""
 
 from dataclasses import asdict
+from inspect import signature
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -9,6 +10,7 @@ import typer
 from equipix._check import naming_memory
 from equipix.cli import terminal
 from equipix.correction.protocol import Correction, check_sensor
+from equipix.errors import InputError
 from equipix.findings import Findings, usable
 from equipix.hardware.quality import quality, smallest_widths
 from equipix.hardware.table import IMAGES, SUFFIXES, UPLOAD, Table
@@ -70,12 +72,23 @@ def hardware(
     correction = load_correction(result)
     check_sensor(correction, sensor)
     if preset:
-        options |= UPLOAD
+        options |= _preset(options)
     table = Table.of(correction, **options)
     cost, said = _cost(correction, frames, options) if frames else ({}, ())
     table.save(output, force=force)
     figures = {"output": str(output), **_summary(table), **cost}
     terminal.show_result(figures, table.findings + said, as_json=as_json)
+
+
+def _preset(options: dict[str, Any]) -> dict[str, Any]:
+    """Return the options of the preset; no other value may be given for one of them."""
+    known = signature(Table.of).parameters
+    for name, value in UPLOAD.items():
+        if options[name] not in (value, known[name].default):
+            raise InputError(
+                f"'{name}' is {options[name]!r}, but '--preset upload' has {value:g}: leave one out"
+            )
+    return UPLOAD
 
 
 def _summary(table: Table) -> dict[str, Any]:
