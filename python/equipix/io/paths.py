@@ -96,7 +96,7 @@ def refuse_inputs(outputs: Iterable[Path], inputs: Iterable[Path], twice: str = 
     FileError
         If an output is one of the inputs or one of the other outputs, by whatever name.
     """
-    taken = {path.resolve() for path in inputs}
+    taken = {split(path)[0].resolve() for path in inputs}
     named: set[Path] = set()
     for path in outputs:
         if path.resolve() in taken:
