@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import h5py
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from astropy.io import fits
 
 import equipix
 from equipix.errors import FileError
-from equipix.io.frames import header, read_frames
+from equipix.io.frames import frame_format, header, read_frames
 
 FRAMES = np.random.default_rng(1).integers(0, 4000, (5, 8, 9)).astype(np.uint16)
 
@@ -63,6 +65,19 @@ def group(folder, frames):
     return folder / "a.zarr"
 
 
+def default(folder, name, kind):
+    """NeXus of another program, whose attributes have a type of their own."""
+    with h5py.File(folder / "a.nxs", "w") as file:
+        file.attrs["default"] = kind("entry")
+        entry = file.create_group("entry")
+        entry.attrs["default"] = kind(f"/{name}")
+        file.require_group(name).attrs["signal"] = kind("b")
+        entry["a"], file[name]["b"] = FRAMES * 0, FRAMES
+        if name == "entry":  # which then is its own default
+            del entry.attrs["signal"]
+    return folder / "a.nxs"
+
+
 WRITERS = (npy, cube, extensions, hdf5, named, nexus, group)
 
 
@@ -110,6 +125,9 @@ def test_a_part_at_a_time(tmp_path, monkeypatch, write):
         (lambda folder: folder / named(folder, FRAMES).rsplit(":")[0], "name one, as in"),
         (lambda folder: npy(folder, np.zeros(3)), "expected numbers of shape"),
         (lambda folder: npy(folder, np.zeros((2, 3), "U1")), "expected numbers of shape"),
+        (lambda folder: npy(folder, FRAMES[:0]), r"of shape \(0, 8, 9\), expected .* 1 or more"),
+        (lambda folder: hdf5(folder, FRAMES[:, :0]), r"of shape \(5, 0, 9\), expected"),
+        (lambda folder: default(folder, "entry", str), "holds /entry/a, /entry/b: name one"),
         (lambda folder: folder / "none.fits", "does not exist"),
         (lambda folder: f"{folder}/none.h5:/entry", "does not exist"),
     ],
@@ -141,3 +159,88 @@ def test_a_saved_result_is_no_frame(tmp_path):
     response.save(tmp_path / "a.fits")
     with pytest.raises(FileError, match="holds a response, expected raw frames"):
         equipix.average(tmp_path / "a.fits")
+
+
+@pytest.mark.parametrize(
+    "kind", [str, np.bytes_, lambda text: np.array([text], h5py.string_dtype())]
+)
+def test_the_default_of_nexus_is_a_text_of_any_type(tmp_path, kind):
+    np.testing.assert_array_equal(read_frames(default(tmp_path, "entry/plot", kind)), FRAMES)
+
+
+@pytest.mark.parametrize("write", [npy, cube, hdf5, named, group], ids=lambda each: each.__name__)
+def test_suffixes_have_any_case(tmp_path, write):
+    path = str(write(tmp_path, FRAMES))
+    file, _, place = path.partition(":")
+    upper = file.removesuffix(suffix := "." + file.rsplit(".")[-1]) + suffix.upper()
+    equipix.io.paths.as_path("frames", file).rename(upper)
+    np.testing.assert_array_equal(read_frames(f"{upper}:{place}" if place else upper), FRAMES)
+
+
+def scaled(unit, **options):
+    unit.scale("int16", **options)
+    return unit
+
+
+def blank(frames):
+    unit = fits.PrimaryHDU(frames.astype(np.int16))
+    unit.header["BLANK"] = -1
+    return unit
+
+
+UNITS = {
+    "blank": lambda: blank(FRAMES),
+    "signed bytes": lambda: fits.PrimaryHDU((FRAMES % 100).astype(np.int8)),
+    "scaled": lambda: scaled(fits.PrimaryHDU(FRAMES / 2), bscale=0.5, bzero=100),
+    "unsigned": lambda: fits.PrimaryHDU(FRAMES),
+    "one frame": lambda: fits.PrimaryHDU(FRAMES[0]),
+}
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_the_type_of_a_fits_file_is_that_of_its_frames(tmp_path, unit):
+    UNITS[unit]().writeto(tmp_path / "a.fits")
+    read = read_frames(tmp_path / "a.fits")
+    assert frame_format(tmp_path / "a.fits") == (read.shape, read.dtype)
+    with fits.open(tmp_path / "a.fits") as units:
+        np.testing.assert_array_equal(read, np.reshape(units[0].data, read.shape))
+
+
+@pytest.mark.parametrize("name", ["a.fits.gz", "a.fits.fz"])
+def test_compressed_fits_files_are_read(tmp_path, name):
+    pressed = fits.CompImageHDU(FRAMES, compression_type="RICE_1")
+    units = [fits.PrimaryHDU(), pressed] if name.endswith("fz") else [fits.PrimaryHDU(FRAMES)]
+    fits.HDUList(units).writeto(tmp_path / name)
+    np.testing.assert_array_equal(read_frames(tmp_path / name), FRAMES)
+    assert frame_format(tmp_path / name) == (FRAMES.shape, FRAMES.dtype)
+
+
+@pytest.mark.parametrize("name", ["ERR", "DQ", "UNCERT", "mask"])
+def test_what_stands_beside_the_frames_of_a_fits_file_is_no_frame(tmp_path, name):
+    units = [fits.PrimaryHDU(), fits.ImageHDU(FRAMES[0], name="SCI")]
+    fits.HDUList([*units, fits.ImageHDU(FRAMES[1], name=name)]).writeto(tmp_path / "a.fits")
+    with pytest.raises(FileError, match=rf"holds {name.upper()} beside its frames, expected fram"):
+        equipix.average(tmp_path / "a.fits")
+
+
+@pytest.mark.parametrize("place", ["", ":/entry/data"])
+def test_an_array_in_a_file_is_not_replaced_by_its_average(tmp_path, run, place):
+    path = hdf5(tmp_path, FRAMES)
+    status, _, told = run("average", f"{path}{place}", "-o", path, "--force")
+    assert (status, "one of the inputs" in told) == (1, True)
+    np.testing.assert_array_equal(read_frames(path), FRAMES)
+
+
+def test_only_what_astropy_says_refuses_a_saved_fits_file(tmp_path, monkeypatch):
+    """A library that warns of a change to come says nothing of the file."""
+    average = equipix.average(FRAMES)
+    average.save(tmp_path / "a.fits")
+    opened = fits.open
+
+    def warned(*given, **options):
+        warnings.warn("soon", DeprecationWarning, stacklevel=1)
+        return opened(*given, **options)
+
+    monkeypatch.setattr(fits, "open", warned)
+    with pytest.warns(DeprecationWarning, match="soon"):
+        assert equipix.load(tmp_path / "a.fits").mean.tobytes() == average.mean.tobytes()

@@ -89,6 +89,7 @@ def test_averages_are_those_of_the_array_on_the_command_line_too(tmp_path):
         ("100x1000:Mono16", "but 3 frames of 100 x 1000 .* Mono16 take 600000:"),
         ("1000x1000:Mono8", "but 1 frame of .* takes 1000000: correct the layout, or copy"),
         ("480x640:Mono12Packed", "with one of Mono8, .*, Mono12p"),
+        ("480x640:Mono12p:big", "Mono12p is packed from the lowest bit on: leave out ':big'"),
         ("480x0:Mono8", "names no layout, expected rows x columns"),
         ("480x640:Mono12", "frame 0 holds 65535, above 4095, .* of Mono12: correct the order of"),
     ],

@@ -5,6 +5,7 @@ An array is (rows, cols) or (..., rows, cols). In HDF5 and Zarr its place stands
 names as the default.
 """
 
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,6 +26,9 @@ HDF5, ZARR = (".h5", ".hdf5", ".nxs", ".nx5"), (".zarr",)
 
 SUFFIXES = (".npy", *HDF5, *ZARR)
 
+_PLACE = re.compile(rf"(.*?(?:{'|'.join(map(re.escape, (*HDF5, *ZARR)))})):(.*)", re.I | re.S)
+"""A file, and the place of an array in it."""
+
 _MOST_LISTED = 8
 
 
@@ -33,12 +37,9 @@ def split(path: Path) -> tuple[Path, str]:
 
     Empty where nothing does.
     """
-    text = str(path)
-    for suffix in (*HDF5, *ZARR):
-        head, found, place = text.partition(f"{suffix}:")
-        if found:
-            return Path(head + suffix), place
-    name, layout = binary.split(text)
+    if (found := _PLACE.fullmatch(str(path))) is not None:
+        return Path(found[1]), found[2]
+    name, layout = binary.split(str(path))
     return (Path(name), layout) if layout else (path, "")
 
 
@@ -54,29 +55,30 @@ def stream_frames(path: Path) -> Iterator[NDArray[Any]]:
     with _opened(path) as array:
         *above, rows, cols = array.shape
         if not above:
-            yield _native(array[:, :])[None]
+            yield native(array[:, :])[None]
             return
         count = max(1, _AT_ONCE // (rows * cols * array.dtype.itemsize))
         for outer in np.ndindex(*above[:-1]):
             for first in range(0, above[-1], count):
-                yield _native(array[(*outer, slice(first, first + count))])
+                yield native(array[(*outer, slice(first, first + count))])
 
 
-def _native(frames: Any) -> NDArray[Any]:
+def native(values: Any) -> NDArray[Any]:
     """Values in the byte order of the machine."""
-    return np.asarray(frames, np.dtype(frames.dtype).newbyteorder("="))
+    return np.asarray(values, np.dtype(values.dtype).newbyteorder("="))
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
     """Open the array of a file, of numbers and of two axes or more."""
     file, place = split(path)
-    opened = _npy if file.suffix == ".npy" else _hdf5 if file.suffix in HDF5 else _zarr
+    suffix = file.suffix.lower()
+    opened = _npy if suffix == ".npy" else _hdf5 if suffix in HDF5 else _zarr
     with opened(file, place) as array:
-        if array.ndim < 2 or np.dtype(array.dtype).kind not in "uif":
+        if array.ndim < 2 or 0 in array.shape or np.dtype(array.dtype).kind not in "uif":
             raise FileError(
                 f"{path}: is {array.dtype} of shape {array.shape}, expected numbers of shape "
-                "(rows, cols) or (n, rows, cols)"
+                "(rows, cols) or (n, rows, cols), each 1 or more"
             )
         yield array
 
@@ -109,17 +111,25 @@ def _hdf5(file: Path, place: str) -> Iterator[Any]:
                 arrays.append(f"/{name}")
 
         root.visititems(visit)
-        chosen = place or _nexus_default(root)
+        chosen = place or _nexus_default(root, h5py.Group)
         yield _chosen(file, root, chosen, arrays, lambda each: isinstance(each, h5py.Dataset))
 
 
-def _nexus_default(root: Any) -> str:
+def _nexus_default(root: Any, kind: type) -> str:
     """Place of the default plot of NeXus: ``default`` of each group, then ``signal``."""
-    group = root
-    while "default" in group.attrs and group.attrs["default"] in group:
-        group = group[group.attrs["default"]]
-    signal = group.attrs.get("signal")
-    return f"{group.name}/{signal}" if isinstance(signal, str) and signal in group else ""
+    groups = [root]
+    while isinstance(found := groups[-1].get(_text(groups[-1], "default")), kind):
+        if found in groups:
+            break
+        groups.append(found)
+    signal = _text(groups[-1], "signal")
+    return f"{groups[-1].name}/{signal}" if signal in groups[-1] else ""
+
+
+def _text(group: Any, name: str) -> str:
+    """Text of an attribute, which programs store in several types; a space where there is none."""
+    found = np.ravel(group.attrs.get(name, " "))[0]
+    return found.decode() if isinstance(found, bytes) else str(found)
 
 
 @contextmanager

@@ -5,10 +5,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
-from equipix.io.arrays import missing
+from equipix.io.arrays import missing, native
 from equipix.io.viewed import Viewed
 
 SUFFIXES = (".asdf",)
@@ -38,7 +37,7 @@ def write_pages(
 def read_pages(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
     """Read what `write_pages` wrote: arrays by name, and the text; of other files none."""
     with _kept(path, lazy_load=False, validate_checksums=True) as kept:
-        pages = {name: _native(each) for name, each in kept.get("arrays", {}).items()}
+        pages = {name: native(each) for name, each in kept.get("arrays", {}).items()}
         return pages, kept.get("metadata", "")
 
 
@@ -52,8 +51,3 @@ def description(path: Path) -> str:
 def _kept(path: Path, **options: bool) -> Iterator[Any]:
     with _asdf().open(path, memmap=False, **options) as file:
         yield file.tree.get(_KEPT, {})
-
-
-def _native(array: Any) -> NDArray[Any]:
-    """Values in the byte order of the machine."""
-    return np.asarray(array, np.dtype(array.dtype).newbyteorder("="))

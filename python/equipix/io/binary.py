@@ -49,6 +49,11 @@ class Layout(NamedTuple):
                 f"480x640:Mono12p, with one of {', '.join(FORMATS)}"
             )
         _, rows, cols, pixel, skip, gap, big = found.groups(default="0")
+        if big != "0" and pixel.endswith("p"):
+            raise FileError(
+                f"{path}: {pixel} is packed from the lowest bit on: leave out ':big', or "
+                "'big_endian' in [layout]"
+            )
         return cls(int(rows), int(cols), pixel, int(skip), int(gap), big != "0")
 
     def __str__(self) -> str:

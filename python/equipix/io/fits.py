@@ -12,17 +12,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from equipix.errors import EquipixError, FileError
+from equipix.errors import FileError
+from equipix.io.arrays import missing, native
 from equipix.io.viewed import Viewed
 
 SUFFIXES = (".fits", ".fit", ".fts")
+
+READ = (*SUFFIXES, ".fz", ".gz")
+"""Suffixes of files of frames; compressed ones are not written."""
 
 _NAME, _TEXT = "ARRAY", "EQUIPIX-METADATA"
 
 _USES = {"flat": "divide frames by it", "gain": "multiply frames by it"}
 
-_KINDS = {8: "u1", 16: "i2", 32: "i4", 64: "i8", -32: "f4", -64: "f8"}
-"""Types of the values by the keyword BITPIX."""
+_BESIDE = ("UNCERT", "ERR", "ERROR", "VAR", "VARIANCE", "IVAR", "MASK", "DQ", "WHT", "WEIGHT")
+"""Names of images that say something of the pixels of another."""
 
 
 def _astropy() -> Any:
@@ -30,9 +34,7 @@ def _astropy() -> Any:
     try:
         from astropy.io import fits
     except ImportError as error:
-        raise EquipixError(
-            "FITS files need astropy, which is not installed: pip install 'equipix[fits]'"
-        ) from error
+        raise missing("FITS", "astropy", "fits") from error
     return fits
 
 
@@ -74,17 +76,17 @@ def ccddata(viewed: Viewed) -> Any:
 
 def read_pages(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
     """Read what `write_pages` wrote: arrays by name, and the text; of other files none."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # of checksums, and of broken headers
-        return _read_pages(path)
-
-
-def _read_pages(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
     fits = _astropy()
-    with path.open("rb") as file, fits.open(file, memmap=False, checksum=True) as units:
+    from astropy.utils.exceptions import AstropyWarning
+
+    with (
+        warnings.catch_warnings(action="error", category=AstropyWarning),  # damage is a warning
+        path.open("rb") as file,
+        fits.open(file, memmap=False, checksum=True) as units,
+    ):
         if _TEXT not in units:
             return {}, ""
-        pages = {unit.header[_NAME]: _native(unit.data) for unit in units if _NAME in unit.header}
+        pages = {unit.header[_NAME]: native(unit.data) for unit in units if _NAME in unit.header}
         return pages, units[_TEXT].data.tobytes().decode()
 
 
@@ -116,7 +118,7 @@ def header(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any], str]:
         *_, rows, cols = images[0].shape
         count = sum(int(np.prod(unit.shape[:-2])) for unit in images)
         text = units[_TEXT].data.tobytes().decode() if _TEXT in units else ""
-        return (count, rows, cols), _dtype(images[0]), text
+        return (count, rows, cols), native(_part(images[0], 1)).dtype, text
 
 
 def stream_frames(path: Path) -> Iterator[NDArray[Any]]:
@@ -125,9 +127,13 @@ def stream_frames(path: Path) -> Iterator[NDArray[Any]]:
         for unit in _images(path, units):
             *above, rows, cols = unit.shape
             for index in np.ndindex(*above):
-                part = (*(slice(k, k + 1) for k in index), slice(None), slice(None))
-                frame = unit.section[part] if above else unit.section[:, :]
-                yield _native(np.reshape(frame, (1, rows, cols)))
+                yield native(np.reshape(_part(unit, None, index), (1, rows, cols)))
+
+
+def _part(unit: Any, size: int | None, index: tuple[int, ...] = ()) -> Any:
+    """Some rows and columns of a frame, in the type that astropy gives to the whole."""
+    frame = [slice(k, k + 1) for k in index or (0,) * (len(unit.shape) - 2)]
+    return unit.section[(*frame, slice(size), slice(size))]
 
 
 def _images(path: Path, units: Any) -> list[Any]:
@@ -137,23 +143,13 @@ def _images(path: Path, units: Any) -> list[Any]:
     if not shapes:
         held = ", ".join(f"{unit.name} {unit.shape}" for unit in units if unit.is_image)
         raise FileError(f"{path}: holds {held or 'tables'}, expected an image")
+    beside = [unit.name for unit in images if unit.name in _BESIDE]
+    if beside:
+        raise FileError(
+            f"{path}: holds {', '.join(beside)} beside its frames, expected frames only: export "
+            "them to a file of their own"
+        )
     if len(shapes) > 1:
         held = ", ".join(f"{unit.name} {unit.shape}" for unit in images)
         raise FileError(f"{path}: holds images of several shapes ({held}), expected one")
     return images
-
-
-def _dtype(unit: Any) -> np.dtype[Any]:
-    """Type of the values: unsigned where BZERO makes it so, floating-point where it scales."""
-    kind = np.dtype(_KINDS[unit.header["BITPIX"]])
-    zero, scale = unit.header.get("BZERO", 0), unit.header.get("BSCALE", 1)
-    if scale == 1 and zero == 2 ** (8 * kind.itemsize - 1) and kind.kind == "i":
-        return np.dtype(f"u{kind.itemsize}")
-    if (scale, zero) != (1, 0) and kind.kind != "f":
-        return np.dtype(np.float32 if kind.itemsize < 4 else np.float64)
-    return kind
-
-
-def _native(array: NDArray[Any]) -> NDArray[Any]:
-    """Values in the byte order of the machine."""
-    return np.asarray(array, array.dtype.newbyteorder("="))

@@ -76,7 +76,7 @@ def stream_frames(
 
 _READERS = {
     **dict.fromkeys(arrays.SUFFIXES, arrays),
-    **dict.fromkeys(fits.SUFFIXES, fits),
+    **dict.fromkeys(fits.READ, fits),
     **dict.fromkeys(camera_raw.SUFFIXES, camera_raw),
 }
 """The module that reads each kind of file besides images: ``header`` and ``stream_frames``."""
@@ -134,8 +134,9 @@ def check_image(path: Path) -> None:
     """Refuse a file of unknown format, and an OME-TIFF whose pages are not frames of one thing."""
     if not has_format(path):
         raise FileError(
-            f"{path}: has no suffix of an image, expected {', '.join(_IMAGES)}; of bare bytes name "
-            f"the layout, as in {path.name}:480x640:Mono16"
+            f"{path}: has no suffix of a format that is read, expected "
+            f"{', '.join((*_IMAGES, *_READERS))}; of bare bytes name the layout, as in "
+            f"{path.name}:480x640:Mono16"
         )
     if path.name.lower().endswith((".ome.tif", ".ome.tiff")):
         tiff.header(path)
@@ -152,7 +153,7 @@ def settings(path: Path) -> Settings:
     """Read exposure time and temperature from headers of FITS, EXIF of TIFF and raw files."""
     suffix = suffix_of(path)
     with reading(path):
-        if suffix in fits.SUFFIXES:
+        if suffix in fits.READ:
             return Settings(*fits.settings(path))
         if suffix in camera_raw.SUFFIXES:
             return Settings(camera_raw.exposure_s(path))

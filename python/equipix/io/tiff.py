@@ -115,7 +115,7 @@ def exposure_s(path: Path) -> float | None:
         page: Any = file.pages[0]
         exif = page.tags.valueof(_EXIF, default={})
         found = page.tags.valueof(_EXPOSURE_TIME, default=exif.get("ExposureTime"))
-    return found[0] / found[1] if found and found[1] else None
+    return found[0] / found[1] if isinstance(found, tuple) and found[1] else None
 
 
 def write_frames(
