@@ -25,6 +25,7 @@ COMMANDS = {
     "inspect": ("calibrate", "Show main figures of a result, and draw its maps."),
     "compare": ("calibrate", "Show how far calibrations of one sensor agree."),
     "report": ("report", "Write results as one page, judged by limits."),
+    "init": ("init", "Write a commented experiment.toml, levels.toml, camera.toml or limits.toml."),
     "emva": ("emva", "Figures of a camera after EMVA 1288, and a page of them."),
     "average": ("frames", "Mean and variance of every pixel over many frames."),
     "correct": ("frames", "Correct frames by a calibration or by response curves."),
