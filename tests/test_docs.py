@@ -21,7 +21,7 @@ import typer.main
 
 import equipix
 import key_tables
-from equipix import metrics
+from equipix import errors, metrics
 from equipix.cli.app import app
 from equipix.diagnosis.inputs import BEFORE
 from equipix.diagnosis.rules import AFTER, LAST
@@ -124,6 +124,12 @@ def test_every_key_has_what_it_must_hold_its_meaning_and_an_example(model):
         if table_of(field.annotation) is None:
             assert field.description, path
             assert example_of(field) is not None, path
+
+
+def test_the_codes_of_errors_are_those_of_the_readme():
+    codes = {code[1:-1] for _, code, _ in table("exit status", "README.md") if "`" in code}
+    raised = {getattr(errors, name) for name in errors.__all__ if name.endswith("Error")}
+    assert codes == {each.code for each in raised} | {"usage"}
 
 
 def test_the_page_describes_every_figure_of_a_camera(tmp_path):
