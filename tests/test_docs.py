@@ -13,26 +13,31 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, get_args
 
 import before_after
 import numpy as np
 import pytest
 import typer.main
-from pydantic import BaseModel
 
 import equipix
-from equipix import metrics
+import key_tables
+from equipix import errors, metrics
 from equipix.cli.app import app
 from equipix.diagnosis.inputs import BEFORE
 from equipix.diagnosis.rules import AFTER, LAST
-from equipix.experiment.manifest import CameraManifest, LevelManifest, Manifest, Sensor
+from equipix.experiment.manifest import (
+    CameraManifest,
+    LevelManifest,
+    Manifest,
+    Sensor,
+    example_of,
+    keys_of,
+    table_of,
+)
 from equipix.findings import WARNINGS
 from equipix.report.camera import figures_of
+from equipix.report.limits import LimitsFile
 from given import written_camera
-
-if TYPE_CHECKING:
-    from pydantic.fields import FieldInfo
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(
@@ -109,48 +114,26 @@ def test_the_manifests_of_the_pages_are_valid():
     assert len(CameraManifest.model_validate(tomllib.loads(camera)).exposure) == 2
 
 
-def manifest_keys(model: type[BaseModel] = Manifest, within: str = "") -> dict[str, str]:
-    """The default of every key of an experiment.toml, as the page writes it."""
-    keys = {}
-    for name, field in model.model_fields.items():
-        tables = tables_in(field.annotation)
-        if not tables or (not field.is_required() and field.default is None):
-            keys[within + name] = default(field)
-        for each in tables:
-            keys |= manifest_keys(each, f"{within}{name}.")
-    return keys
+@pytest.mark.parametrize("name", key_tables.TABLES)
+def test_the_tables_of_keys_are_those_of_the_schema(name):
+    page, model = key_tables.TABLES[name]
+    assert key_tables.reference(model) in TEXTS[f"docs/{page}"]
+    assert key_tables.with_table(TEXTS[f"docs/{page}"], name, model) == TEXTS[f"docs/{page}"]
 
 
-def tables_in(annotation: object) -> list[type[BaseModel]]:
-    """The tables that a key holds, in a list or alone."""
-    if is_table(annotation):
-        return [annotation]
-    return [table for each in get_args(annotation) for table in tables_in(each)]
+@pytest.mark.parametrize("model", [Manifest, LevelManifest, CameraManifest, LimitsFile])
+def test_every_key_has_what_it_must_hold_its_meaning_and_an_example(model):
+    for path, field in keys_of(model):
+        assert field.title, path
+        if table_of(field.annotation) is None:
+            assert field.description, path
+            assert example_of(field) is not None, path
 
 
-def is_table(annotation: object) -> bool:
-    return inspect.isclass(annotation) and issubclass(annotation, BaseModel)
-
-
-def default(field: FieldInfo) -> str:
-    if field.is_required():
-        return "required"
-    text = {None: "none", "": "empty"}.get(field.default, str(field.default))
-    return text.lower() if isinstance(field.default, bool) else text
-
-
-def test_the_page_describes_every_key_of_an_experiment_and_its_default():
-    rows = table("key", "docs/experiment.md")
-    described = {key.split("`")[1]: given for key, _, given, _ in rows}
-    assert described == manifest_keys()
-
-
-def test_the_page_describes_every_key_of_a_camera_and_its_default():
-    rows = table("key", "docs/camera.md")
-    described = {key.split("`")[1]: given for key, _, given, _ in rows}
-    refused = tuple(f"sensor.{key}" for key in ("saturation", "gain_dn_per_e", "mask", "region"))
-    keys = manifest_keys(CameraManifest).items()
-    assert described == {key: given for key, given in keys if not key.startswith(refused)}
+def test_the_codes_of_errors_are_those_of_the_readme():
+    codes = {code[1:-1] for _, code, _ in table("exit status", "README.md") if "`" in code}
+    raised = {getattr(errors, name) for name in errors.__all__ if name.endswith("Error")}
+    assert codes == {each.code for each in raised} | {"usage"}
 
 
 def test_the_page_describes_every_figure_of_a_camera(tmp_path):

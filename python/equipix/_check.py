@@ -1,6 +1,7 @@
 """Types of arguments, and their checks: arrays, masks, counts, shapes, words for messages."""
 
 import functools
+import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from os import PathLike
@@ -11,6 +12,11 @@ import numpy.typing as npt
 from numpy.typing import NDArray
 
 from equipix.errors import InputError, InsufficientMemoryError
+
+LOG = logging.getLogger("equipix")
+"""Tells the steps of the work: at INFO what a user may want to see, at DEBUG more."""
+
+LOG.addHandler(logging.NullHandler())
 
 ArrayLike: TypeAlias = npt.ArrayLike
 

@@ -16,11 +16,21 @@ __dir__ = __all__.copy
 
 
 class EquipixError(Exception):
-    """Base class of all errors of this package."""
+    """Base class of all errors of this package.
+
+    Attributes
+    ----------
+    code : str
+        Kind of the error for programs: "failed", "input", "file" or "memory".
+    """
+
+    code: str = "failed"
 
 
 class InputError(EquipixError, ValueError):
     """An argument is invalid; the message contains its name, its value and the remedy."""
+
+    code = "input"
 
 
 class SpotError(InputError):
@@ -38,6 +48,8 @@ _REMEDIES = {
 class FileError(EquipixError, OSError):
     """A file cannot be read or written, or holds something else; the message names it."""
 
+    code = "file"
+
     def __str__(self) -> str:
         """Return the message, with a remedy where the reader of the file gave none."""
         said = super().__str__()
@@ -50,6 +62,8 @@ class UnsupportedFileError(FileError):
 
 class InsufficientMemoryError(EquipixError, MemoryError):
     """Not enough memory for the work; the message contains the number of bytes."""
+
+    code = "memory"
 
 
 class EquipixWarning(UserWarning):

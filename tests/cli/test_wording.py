@@ -47,6 +47,20 @@ def keywords():
     return {a or b for text in literals() if " " in text for a, b in NAMED.findall(text)}
 
 
+def test_options_that_messages_name_exist():
+    """Of any command; messages of a library do not know which command calls it."""
+    known = {"--help", "--version", "--install-completion", "--show-completion"}
+    for name in COMMANDS:
+        known |= {option for each in parameters(command(name)) for option in each.opts}
+    named = {
+        (option, text)
+        for text in literals()
+        for option in re.findall(r"(?<![\w-])--[a-z][a-z-]*[a-z]", text)
+    }
+    assert len(named) > 30
+    assert [each for each in sorted(named) if each[0] not in known] == []
+
+
 @pytest.fixture(params=COMMANDS)
 def called(request):
     return command(request.param)

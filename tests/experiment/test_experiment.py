@@ -245,6 +245,14 @@ def test_real_input(data_dir):
             'name = "p1"\ntime = 1',
             r"'time' is missing in exposure 'p0': give all or none",
         ),
+        ('name = "p1"', 'name = "p1"\nshifts = [1, 2]', r"'shifts' .*: did you mean 'shift'\?"),
+        (
+            "bit_depth = 12",
+            "bit_dept = 12",
+            r"'bit_dept' in \[sensor\]: did you mean 'bit_depth'\?",
+        ),
+        ("[dark]", "[drak]", r"unknown key 'drak': did you mean 'dark'\?"),
+        ("bit_depth = 12", "xyz = 1", r"'xyz' in \[sensor\]: known are name, bit_depth, "),
         ('name = "p1"', 'name = "p1"\nshift_um = [1, 2]', r"'shift_um' .* divide micrometres"),
         ('name = "p0"', 'name = "p0"\nshift = ["9 um", "0 um"]', r"holds '9 um'.* without a unit"),
         ('name = "p2"', "", r"key 'name' is missing in exposure 2"),
@@ -290,7 +298,7 @@ def test_a_mistake_of_all_exposures_is_said_once(manifest, tmp_path):
     problems = str(caught.value).removeprefix(f"{path}: ").split("; ")
     assert problems == [
         "'flux' in exposure 0 ('p0') holds 0, expected a positive number, and likewise in 4 more",
-        "unknown key 'shfit' in exposure 0 ('p0'), and likewise in 4 more",
+        "unknown key 'shfit' in exposure 0 ('p0'), and likewise in 4 more: did you mean 'shift'?",
     ]
 
 

@@ -160,10 +160,13 @@ class TestLimits:
     @pytest.mark.parametrize(
         ("text", "words"),
         [
-            ("[calibration]\nsensitivty_std = 1", "unknown key 'sensitivty_std'"),
-            ("[calibrations]\nconverged = true", "unknown key 'calibrations'"),
-            ("[calibration]\nconverged = 1", "'converged' .* holds 1, expected"),
-            ("[calibration]\nreduced_chi2 = 1", "'reduced_chi2' .* holds 1, expected"),
+            (
+                "[calibration]\nsensitivty_std = 1",
+                r"key 'sensitivty_std' in \[calibration\]: did you mean 'sensitivity_std'\?",
+            ),
+            ("[calibrations]\nconverged = true", r"'calibrations': did you mean 'calibration'\?"),
+            ("[calibration]\nconverged = 1", "'converged' .* holds 1, expected true or false"),
+            ("[calibration]\nreduced_chi2 = 1", r"'reduced_chi2' .* holds 1, expected \[low, high"),
             ("[calibration", "not valid TOML"),
         ],
     )
@@ -186,7 +189,7 @@ class TestCommand:
 
     def test_ends_with_1_beyond_a_limit_if_asked_to(self, saved, tmp_path, run):
         limits, out = tmp_path / "limits.toml", tmp_path / "report.html"
-        status, _, _ = run("report", "--limits-template", limits)
+        status, _, _ = run("init", "limits", tmp_path)
         assert status == 0
         arguments = ("report", saved, "-o", out, "--limits", limits)
         assert run(*arguments)[0] == 0
@@ -195,11 +198,14 @@ class TestCommand:
         assert f"beyond the limits of {limits}: {saved}" in told
         assert "FAIL" in out.read_text(encoding="utf-8")
 
+    @pytest.mark.parametrize("arguments", [(), ("SAVED",), ("-o", "OUT.html")])
+    def test_needs_results_and_a_page(self, tmp_path, run, arguments):
+        assert run("report", *arguments)[0] == 2
+        assert not [*tmp_path.iterdir()]
+
     @pytest.mark.parametrize(
         ("arguments", "words"),
         [
-            ((), "name results and the page"),
-            (("SAVED",), "name results and the page"),
             (("SAVED", "-o", "OUT.pdf"), "ends in none of .html"),
             (("SAVED", "-o", "OUT.html", "--check"), "--check needs --limits"),
             (("missing.tif", "-o", "OUT.html"), "missing.tif: does not exist"),

@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 from numpy.typing import ArrayLike
 
-from equipix._check import FluxModel, Method, Progress, naming_memory
+from equipix._check import LOG, FluxModel, Method, Progress, naming_memory
 from equipix._native import Fit
 from equipix.calibration.result import Calibration
 from equipix.diagnosis.evidence import Evidence
@@ -253,6 +253,8 @@ def calibrated(
     for step in (without_false_pixels, without_faint_pixels, widened, with_dark_misfit):
         weighted = step(weighted, options)
     evidence = Evidence.of(weighted, options, exposures.flux)
+    sweeps, errors = weighted.fit.sweeps, weighted.fit.error_estimate
+    LOG.info("fitted: %d passes over the data, estimated error %.2g", sweeps[-1], errors[-1])
     # Before the error bars, which may be refused or interrupted.
     said += say(*ask(AFTER, evidence, said))
     evidence = evidence.with_error_bars()

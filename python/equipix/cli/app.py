@@ -1,5 +1,7 @@
 """The commands of the command line, each imported when it is called."""
 
+import json
+import logging
 import re
 import sys
 import warnings
@@ -8,11 +10,11 @@ from contextvars import ContextVar
 from functools import cache
 from importlib import import_module
 from inspect import signature
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 from typer.core import TyperCommand, TyperGroup
-from typer.main import get_group
+from typer.main import get_command, get_group
 
 from equipix._native import __version__
 from equipix.errors import EquipixError, EquipixWarning
@@ -25,10 +27,14 @@ COMMANDS = {
     "inspect": ("calibrate", "Show main figures of a result, and draw its maps."),
     "compare": ("calibrate", "Show how far calibrations of one sensor agree."),
     "report": ("report", "Write results as one page, judged by limits."),
+    "init": ("init", "Write a commented experiment.toml, levels.toml, camera.toml or limits.toml."),
     "emva": ("emva", "Figures of a camera after EMVA 1288, and a page of them."),
     "convert": ("report", "Write a result in another format, for other programs."),
     "average": ("frames", "Mean and variance of every pixel over many frames."),
     "correct": ("frames", "Correct frames by a calibration or by response curves."),
+    "combine": ("corrections", "Make one correction of two that are applied in turn."),
+    "lens": ("corrections", "Fit the fall-off of a lens to a flat frame, and save its gain."),
+    "bolometer": ("corrections", "Fit a correction that follows temperature and bias."),
     "nuc": ("nuc", "Uniform source: fit response curves, find bad pixels, measure quality."),
     "scene": ("scene", "Learn gain and offset of each pixel from a moving scene."),
     "hardware": ("hardware", "Write a correction as words for a camera's electronics."),
@@ -60,7 +66,6 @@ app = typer.Typer(
     cls=_Commands,
     help="Pixel sensitivity of image sensors, measured without a uniform light source.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -68,34 +73,100 @@ app = typer.Typer(
 
 
 def command(name: str) -> Any:
-    """Import a command, with its options."""
+    """Import a command, with its options and --verbose."""
     module = import_module(f"equipix.cli.{COMMANDS[name][0]}")
-    return get_group(module.commands).commands[name]
+    found = get_group(module.commands).commands[name]
+    for each in getattr(found, "commands", {"": found}).values():
+        each.params += get_command(_verbose).params
+    return found
+
+
+_USAGE: Any = typer.BadParameter.__base__
+"""What typer raises of a wrong usage; it has no public name."""
 
 
 def run(arguments: list[str] | None) -> None:
-    """Run the command line, errors and warnings as one line each."""
+    """Run the command line, errors and warnings as one line each, with --json an error as JSON."""
+    given = sys.argv[1:] if arguments is None else arguments
+    as_json = "--json" in given
     with warnings.catch_warnings():
         warnings.simplefilter("always", EquipixWarning)
         warnings.showwarning = show_warning
         try:
-            app(arguments, prog_name="equipix")
+            # Else typer prints what is wrong with the usage, in a box.
+            status = app(given, prog_name="equipix", standalone_mode=not as_json)
         except (EquipixError, OSError, MemoryError) as error:
-            say("error", error or type(error).__name__)
-            raise SystemExit(1) from None
+            code = getattr(error, "code", "memory" if isinstance(error, MemoryError) else "file")
+            _fail(str(error) or type(error).__name__, code, 1, as_json=as_json)
+        except _USAGE as error:
+            _fail(error.format_message(), "usage", 2, as_json=as_json)
+    raise SystemExit(status or 0)
+
+
+def _fail(message: str, code: str, status: int, *, as_json: bool) -> NoReturn:
+    """Write an error to stderr, and end; stdout is for results alone."""
+    if as_json:
+        told = {"error": _in_line(message), "code": code}
+        print(json.dumps(told), file=sys.stderr)  # noqa: T201
+    else:
+        say("error", message)
+    raise SystemExit(status) from None
 
 
 def say(kind: str, message: object) -> None:
     """Write one line to stderr: ``equipix: kind: message``, which names options."""
+    print(f"equipix: {kind}: {_in_line(message)}", file=sys.stderr)  # noqa: T201
+
+
+def _in_line(message: object) -> str:
+    """Write a message in one line, with the options of the command that was called."""
     text, called = " ".join(str(message).split()), CALLED.get()
-    if called is not None:
-        text = in_options(text, called)
-    print(f"equipix: {kind}: {text}", file=sys.stderr)  # noqa: T201
+    return text if called is None else in_options(text, called)
 
 
 def show_warning(message: Warning | str, *_: object, **__: object) -> None:
     """Replace `warnings.showwarning`: one line on stderr, no source code."""
     say("warning", message)
+
+
+class _Lines(logging.Handler):
+    """Writes what the package logs as lines on stderr."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write one record."""
+        seconds = record.relativeCreated / 1e3
+        say(record.levelname.lower(), f"{seconds:.2f} s: {record.getMessage()}")
+
+
+def _log(times: int) -> None:
+    """Show what the package logs, of --verbose twice the details too."""
+    logger = logging.getLogger("equipix")
+    logger.handlers = [each for each in logger.handlers if not isinstance(each, _Lines)]
+    logger.setLevel(logging.NOTSET)
+    if times:
+        logger.addHandler(_Lines())
+        logger.setLevel(logging.INFO if times == 1 else logging.DEBUG)
+
+
+_verbose = typer.Typer(add_completion=False)
+"""Holds the option that every command gets."""
+
+
+@_verbose.command()
+def _(
+    _times: Annotated[
+        int,
+        typer.Option(
+            "--verbose",
+            "-v",
+            count=True,
+            callback=_log,
+            expose_value=False,
+            show_default=False,
+            help="Show the steps of the work on stderr; -vv in detail.",
+        ),
+    ] = 0,
+) -> None: ...
 
 
 _VALUE = r"(?:'([^']*)'|\(([^,)]*),([^)]*)\)|(\w+(?:\.\w+)*))"
@@ -133,7 +204,7 @@ def in_options(message: str, called: Any) -> str:
 
 
 def _with_values(message: str, name: str, option: str) -> str:
-    """Write ``name='value'`` and ``'name' (--name value)`` as ``--name value``."""
+    """Write ``name='value'`` and ``'name' (--NAME value)`` as ``--NAME value``."""
     message = re.sub(rf"(?<!=)'\w+' \(({option}[^)]*)\)", r"\1", message)
     message = re.sub(rf"\b{name}={_VALUE}", rf"{option} \1\2\3\4", message)
     message = message.replace(f"{option} True", option)

@@ -41,21 +41,27 @@ def average(
 ) -> None:
     """Mean and variance of every pixel over many frames."""
     terminal.check_output(output, force=force, suffixes=SUFFIXES)
+    found = averaged(frames, dark, output, mask, workers=workers, **options)
+    terminal.show_saved(output, found, force=force, as_json=as_json)
+
+
+def averaged(
+    frames: list[str], dark: list[str] | None, output: Path, mask: Path | None, **options: Any
+) -> statistics.FrameStatistics:
+    """Average frames, less their dark, with findings and the hashes of the files."""
     images, offsets = find_files(frames), find_files(dark) if dark else []
     refuse_inputs([output], [*images, *offsets, *terminal.given(mask)])
     hashes = refuse_repeated_files(images, offsets)
     with terminal.working(mask) as (progress, excluded):
         offset = None
-        common: dict[str, Any] = {"workers": workers, "progress": progress}
         if dark:
-            averaged = any(statistics.saved_shape(file) for file in offsets)
-            of_dark = options | ({"reject": None} if averaged else {})
-            offset = average_frames(dark, **common, **of_dark)
+            is_saved = any(statistics.saved_shape(file) for file in offsets)
+            of_dark = options | ({"reject": None} if is_saved else {})
+            offset = average_frames(dark, progress=progress, **of_dark)
             statistics.refuse_subtracted(offset, " ".join(dark))
-        found = average_frames(frames, dark=offset, mask=excluded, **common, **options)
+        found = average_frames(frames, dark=offset, mask=excluded, progress=progress, **options)
     said = say(*ask(statistics.AVERAGED, found))
-    found = replace(found, findings=said, metadata=with_inputs(found.metadata, hashes))
-    terminal.show_saved(output, found, force=force, as_json=as_json)
+    return replace(found, findings=said, metadata=with_inputs(found.metadata, hashes))
 
 
 @commands.command(epilog="Example: equipix correct cal.tif raw/*.tif -o corrected/")

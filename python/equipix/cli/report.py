@@ -11,7 +11,7 @@ from equipix.hardware.table import Table
 from equipix.io.formats import SUFFIXES
 from equipix.io.paths import write_whole
 from equipix.io.viewed import Use
-from equipix.report.limits import limits_template, read_limits
+from equipix.report.limits import read_limits
 from equipix.report.page import page, part_of
 from equipix.saved_results import load
 from equipix.scene.scene_correction import SceneCorrection
@@ -23,47 +23,32 @@ commands = typer.Typer()
     epilog="Example: equipix report cal.tif -o report.html --limits limits.toml --check"
 )
 def report(
-    results: Annotated[
-        list[Path] | None, typer.Argument(help="Results that equipix has saved.")
-    ] = None,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="The page: .html.")] = None,
+    results: Annotated[list[Path], typer.Argument(help="Results that equipix has saved.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The page: .html.")],
     limits: Annotated[
         Path | None, typer.Option(help="Limits that the figures must keep: .toml.")
     ] = None,
     check: Annotated[
         bool, typer.Option("--check", help="End with status 1 if a figure is beyond its limit.")
     ] = False,
-    limits_template_: Annotated[
-        Path | None,
-        typer.Option("--limits-template", help="Write a file of usual limits, and do no more."),
-    ] = None,
     force: terminal.Force = False,
     as_json: terminal.Json = False,
 ) -> None:
     """Write results as one page, judged by limits."""
-    if limits_template_ is not None:
-        _write(limits_template_, limits_template(), force=force)
-        terminal.show_result({"output": str(limits_template_)}, as_json=as_json)
-        return
-    if not results or output is None:
-        raise InputError("name results and the page: equipix report cal.tif --output report.html")
     terminal.check_output(output, results, force=force, suffixes=(".html",))
     if check and limits is None:
-        raise InputError("--check needs --limits; --limits-template writes a file of usual ones")
+        raise InputError("--check needs --limits: equipix init limits writes a file of usual ones")
     wanted = read_limits(limits)
     parts = [part_of(str(file), load(file), wanted, share=len(results)) for file in results]
     title = f"Report of {results[0].name}" if len(results) == 1 else f"{len(results)} results"
-    _write(output, page(parts, title), force=force)
+    text = page(parts, title)
+    with write_whole(output, force=force) as temporary:
+        temporary.write_text(text, encoding="utf-8")
     verdicts = {part.name: part.verdict or "not judged" for part in parts}
     terminal.show_result({"output": str(output), "verdicts": verdicts}, as_json=as_json)
     failed = [part.name for part in parts if part.verdict == "FAIL"]
     if check and failed:
         raise EquipixError(f"beyond the limits of {limits}: {', '.join(failed)}")
-
-
-def _write(path: Path, text: str, *, force: bool) -> None:
-    with write_whole(path, force=force) as temporary:
-        temporary.write_text(text, encoding="utf-8")
 
 
 @commands.command(epilog="Example: equipix convert cal.tif cal.fits --as flat --mean-one")

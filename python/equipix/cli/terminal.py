@@ -17,6 +17,7 @@ from typer.models import OptionInfo
 from equipix._check import Array, Bools, Progress
 from equipix.calibration.result import Calibration
 from equipix.correction.correct_files import warn_of_corrected
+from equipix.correction.polynomial import Polynomial
 from equipix.errors import FileError, InputError
 from equipix.experiment import image_files
 from equipix.findings import Findings
@@ -27,7 +28,7 @@ from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.response import Response
 from equipix.report.figures import summary, told
 
-_Saved = Calibration | FrameStatistics | Response
+_Saved = Calibration | FrameStatistics | Polynomial | Response
 
 _NO_NUMBER = r"\(?-?\b(?:inf|nan)\b.*"
 

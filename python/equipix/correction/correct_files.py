@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from equipix._check import Array, Display, Flagged, OutputType, Progress
+from equipix._check import LOG, Array, Display, Flagged, OutputType, Progress
 from equipix.correction.apply import FAST, Corrector, output_dtype, usual_treatment
 from equipix.correction.protocol import Correction, Dark, refuse_dark
 from equipix.errors import FileError, InputError
@@ -140,6 +140,7 @@ def correct_files(
     said = warn_of_corrected(headers, origin)
     flagged = usual_treatment(wanted) if flagged is None else flagged
     of_dark = _dark(correction, dark)
+    LOG.info("corrects %d frames to %s, dark: %s, flagged pixels: %s", total, wanted, dark, flagged)
     corrector = Corrector(
         correction,
         "float32" if display else wanted,

@@ -1,11 +1,19 @@
-"""The content of manifests, checked: errors name the value and its place."""
+"""The content of manifests, checked: errors name the value and its place.
+
+The models are the one schema of the files. Each key has what it must hold as `title`, its meaning
+as `description` and an example: messages, templates and the reference in docs/ are made of them.
+"""
 
 import tomllib
+from collections.abc import Iterator
+from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args, get_origin
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+from pydantic.fields import FieldInfo
 from pydantic.functional_validators import BeforeValidator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
@@ -15,55 +23,6 @@ from equipix.io import binary
 from equipix.io.frames import Settings, has_format
 from equipix.io.paths import find_files
 from equipix.measured.colour import Colours
-
-_WANTED = {
-    "format": "1: a newer format needs a newer equipix",
-    "sensor": "a table",
-    "bit_depth": "a whole number from 1 to 16",
-    "saturation": "a positive number (DN)",
-    "gain_dn_per_e": "a positive number (DN per electron)",
-    "cfa": "colour filters: 'RGGB', rows of one period or lists of labels",
-    "mask": "an image file",
-    "region": "tables [[sensor.region]]",
-    "rows": "[first, end], two whole numbers from 0 on, the first below the end",
-    "cols": "[first, end], two whole numbers from 0 on, the first below the end",
-    "centre": "[row, col] in pixels",
-    "radius": "a positive number of pixels",
-    "outside": "true or false",
-    "dark": "a table [dark], or tables [[dark]]; files in a camera.toml",
-    "dark_temperature_tolerance_c": "a number of kelvins, not negative",
-    "layout": "a table",
-    "shape": "[rows, cols], two whole numbers above 0",
-    "pixel": f"one of {', '.join(binary.FORMATS)}",
-    "big_endian": "true or false",
-    "skip_bytes": "a whole number, not negative",
-    "gap_bytes": "a whole number, not negative",
-    "exposure_s": "a number of seconds, not negative",
-    "temperature_c": "a number of degrees Celsius",
-    "exposure": "two or more tables [[exposure]]",
-    "level": "one or more tables [[level]]",
-    "value": "a number",
-    "unit": "a text",
-    "name": "a text",
-    "frames": "a file, a glob or a list of them",
-    "aperture_before": "a file, a glob or a list of them",
-    "aperture_after": "a file, a glob or a list of them",
-    "shift": "[row, col] in pixels, without a unit: divide micrometres by the pixel pitch",
-    "shift_std": "[row, col] in pixels, not negative",
-    "flux": "a positive number",
-    "flux_std": "a positive number, relative to the flux",
-    "time": "a number of seconds",
-    "rotation": "0, 90, 180 or 270",
-    "photons": "a number of photons per pixel, not negative",
-    "irradiance_uw_cm2": "a number of µW/cm², not negative",
-    "light": "a table",
-    "wavelength_nm": "a positive number of nanometres",
-    "pixel_um": "a positive number of micrometres",
-    "spatial": "a table",
-}
-
-KEYS = frozenset(_WANTED)
-"""All keys and tables of the manifests."""
 
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 
@@ -80,7 +39,24 @@ Errors = Annotated[list[NotNegative], Field(min_length=2, max_length=2)]
 Span = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=2, max_length=2)]
 
 
-_Content = TypeVar("_Content", bound=BaseModel)
+FILES = "a file, a glob or a list of them"
+
+DARKS = "a table [dark], or tables [[dark]]"
+
+_Content = TypeVar("_Content", bound="Table")
+
+
+def key(wanted: str, meaning: str = "", example: Any = None, default: Any = None) -> Any:
+    """Describe a key that may be left out: what it must hold, its meaning, an example."""
+    return Field(default, title=wanted, description=meaning, examples=[example])
+
+
+needed = partial(key, default=...)
+"""Describe a key that a file must have."""
+
+
+def _format() -> Any:
+    return key("1: a newer format needs a newer equipix", "version of this file format", 1, 1)
 
 
 class Table(BaseModel):
@@ -89,14 +65,19 @@ class Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
+_SPAN = "[first, end], two whole numbers from 0 on, the first below the end"
+
+
 class Region(Table):
     """One ``[[sensor.region]]``: a rectangle or a circle of pixels that must not be used."""
 
-    rows: Span | None = None
-    cols: Span | None = None
-    centre: Pair | None = None
-    radius: Positive | None = None
-    outside: bool = False
+    rows: Span | None = key(
+        _SPAN, "rows of a rectangle, without the end; all unless given", [0, 10]
+    )
+    cols: Span | None = key(_SPAN, "columns of a rectangle, likewise", [0, 10])
+    centre: Pair | None = key("[row, col] in pixels", "centre of a circle", [291, 391])
+    radius: Positive | None = key("a positive number of pixels", "radius of the circle", 280)
+    outside: bool = key("true or false", "whether what is outside is not used", True, False)
 
     @model_validator(mode="after")
     def _one_shape(self) -> Self:
@@ -141,11 +122,26 @@ class Region(Table):
 class Layout(Table):
     """Table ``[layout]``: how the bytes of files without a format of their own are frames."""
 
-    shape: Annotated[list[Annotated[int, Field(gt=0)]], Field(min_length=2, max_length=2)]
-    pixel: Literal["Mono8", "Mono10", "Mono10p", "Mono12", "Mono12p", "Mono14", "Mono16"]
-    big_endian: bool = False
-    skip_bytes: Annotated[int, Field(ge=0)] = 0
-    gap_bytes: Annotated[int, Field(ge=0)] = 0
+    shape: Annotated[list[Annotated[int, Field(gt=0)]], Field(min_length=2, max_length=2)] = needed(
+        "[rows, cols], two whole numbers above 0", "sizes of a frame", [480, 640]
+    )
+    pixel: Literal["Mono8", "Mono10", "Mono10p", "Mono12", "Mono12p", "Mono14", "Mono16"] = needed(
+        f"one of {', '.join(binary.FORMATS)}",
+        "format of a pixel, by the names of GenICam",
+        "Mono12p",
+    )
+    big_endian: bool = key(
+        "true or false",
+        "whether the high byte of two is the first; not with packed formats",
+        True,
+        False,
+    )
+    skip_bytes: Annotated[int, Field(ge=0)] = key(
+        "a whole number, not negative", "bytes before the first frame", 16, 0
+    )
+    gap_bytes: Annotated[int, Field(ge=0)] = key(
+        "a whole number, not negative", "bytes between two frames", 8, 0
+    )
 
     def behind(self, file: Path) -> Path:
         """Return a file with its layout behind its name, unless it has a format of its own."""
@@ -158,15 +154,36 @@ class Layout(Table):
 class Sensor(Table):
     """Table ``[sensor]``: levels in DN, and pixels that must not be used."""
 
-    name: str = ""
-    bit_depth: Annotated[int, Field(ge=1, le=16)] | None = None
-    saturation: Positive | None = None
-    gain_dn_per_e: Positive | None = None
-    cfa: Text | list[Text] | list[list[Text]] | None = None
+    name: str = key("a text", "name of the sensor, kept in the result", "array 7", "")
+    bit_depth: Annotated[int, Field(ge=1, le=16)] | None = key(
+        "a whole number from 1 to 16", "bits of the camera; 2^bits − 1 counts as saturated", 12
+    )
+    saturation: Positive | None = key(
+        "a positive number (DN)",
+        "saturation, if not that of `bit_depth` or of the file's type",
+        4000,
+    )
+    gain_dn_per_e: Positive | None = key(
+        "a positive number (DN per electron)", "gain for the noise model; fitted unless given", 0.3
+    )
+    cfa: Text | list[Text] | list[list[Text]] | None = key(
+        "colour filters: 'RGGB', rows of one period or lists of labels",
+        "colour filters of the pixels: see [colour.md](colour.md)",
+        "RGGB",
+    )
     # A dark current that doubles every 6.5 K changes by 5 % in half a kelvin.
-    dark_temperature_tolerance_c: Annotated[FiniteFloat, Field(ge=0)] = 0.5
-    mask: Text | None = None
-    region: Annotated[list[Region], Field(min_length=1)] | None = None
+    dark_temperature_tolerance_c: NotNegative = key(
+        "a number of kelvins, not negative",
+        "largest difference between the temperatures of a dark and an exposure",
+        2.0,
+        0.5,
+    )
+    mask: Text | None = key(
+        "an image (TIFF, PNG, PGM, BMP) or .npy", "pixels not 0 in it are not used", "mask.png"
+    )
+    region: Annotated[list[Region], Field(min_length=1)] | None = key(
+        "tables [[sensor.region]]", "areas that are not used, each a rectangle or a circle"
+    )
 
     @model_validator(mode="after")
     def _cfa_is_a_pattern(self) -> Self:
@@ -208,9 +225,17 @@ class Sensor(Table):
 class Taken(Table):
     """Frames, with the exposure time and temperature that they were taken with."""
 
-    frames: Files
-    exposure_s: Annotated[FiniteFloat, Field(ge=0)] | None = None
-    temperature_c: FiniteFloat | None = None
+    frames: Files = needed(FILES, "frames")
+    exposure_s: NotNegative | None = key(
+        "a number of seconds, not negative",
+        "exposure time of a frame, by which a dark is chosen",
+        0.02,
+    )
+    temperature_c: FiniteFloat | None = key(
+        "a number of degrees Celsius",
+        "temperature of the sensor, by which a dark is chosen",
+        -10.0,
+    )
 
     @property
     def settings(self) -> Settings:
@@ -220,6 +245,8 @@ class Taken(Table):
 
 class Dark(Taken):
     """Table ``[dark]``, or one of several ``[[dark]]``: frames without light."""
+
+    frames: Files = needed(FILES, "frames without light", "dark/*.tif")
 
 
 Darks = Annotated[
@@ -232,15 +259,43 @@ Darks = Annotated[
 class Exposure(Taken):
     """One ``[[exposure]]``: the frames of one sensor position, and that position."""
 
-    name: Text
-    aperture_before: Files | None = None
-    aperture_after: Files | None = None
-    shift: Pair | None = None
-    shift_std: Errors | None = None
-    flux: Positive | None = None
-    flux_std: Positive | None = None
-    time: FiniteFloat | None = None
-    rotation: Literal[0, 90, 180, 270] = 0
+    name: Text = needed("a text", "name of the exposure, different for each", "p0")
+    frames: Files = needed(FILES, "frames at this position", "frames/p0-*.tif")
+    aperture_before: Files | None = key(
+        FILES, "images of the hole before the move to this position", "hole/p1-before.tif"
+    )
+    aperture_after: Files | None = key(
+        FILES, "images of the hole after this move", "hole/p1-after.tif"
+    )
+    shift: Pair | None = key(
+        "[row, col] in pixels, without a unit: divide micrometres by the pixel pitch",
+        "position where it is known; not the step from the position before. Excludes the two keys "
+        "above. One of the two ways is required from the second exposure on",
+        [0, 19],
+    )
+    shift_std: Errors | None = key(
+        "[row, col] in pixels, not negative",
+        "standard deviations of both numbers of `shift`, at most 0.3; `shift` is then refined. A "
+        "pair also where both are the same",
+        [0.05, 0.05],
+    )
+    flux: Positive | None = key(
+        "a positive number", "relative power of the lamp; in all exposures or in none", 1.0
+    )
+    flux_std: Positive | None = key(
+        "a positive number, relative to the flux",
+        "standard deviation of `flux`; in all exposures or in none. Without it `flux` counts as "
+        "exact",
+        0.001,
+    )
+    time: FiniteFloat | None = key(
+        "a number of seconds",
+        "time for a linear drift of the lamp; in all exposures or in none",
+        0.0,
+    )
+    rotation: Literal[0, 90, 180, 270] = key(
+        "0, 90, 180 or 270", "degrees by which the sensor is turned in the beam", 180, 0
+    )
 
     @model_validator(mode="after")
     def _one_way_to_know_the_position(self) -> Self:
@@ -258,9 +313,12 @@ class Exposure(Taken):
 class Level(Taken):
     """One ``[[level]]``: frames of a uniform source, and what the source was set to."""
 
-    name: str = ""
-    value: FiniteFloat | None = None
-    unit: Text | None = None
+    frames: Files = needed(FILES, "frames of this level, or their saved average", "20C/*.tif")
+    name: str = key("a text", "name of the level; its value or number unless given", "20C", "")
+    value: FiniteFloat | None = key(
+        "a number", "what the source was set to; means should rise with it", 20
+    )
+    unit: Text | None = key("a text", "unit of all values", "°C")
 
     @model_validator(mode="after")
     def _unit_of_a_value(self) -> Self:
@@ -272,11 +330,16 @@ class Level(Taken):
 class LevelManifest(Table):
     """The whole levels.toml."""
 
-    format: Literal[1] = 1
-    sensor: Sensor = Sensor()
-    layout: Layout | None = None
-    dark: Darks | None = None
-    level: Annotated[list[Level], Field(min_length=1)]
+    format: Literal[1] = _format()
+    sensor: Sensor = key("a table", default=Sensor())
+    layout: Layout | None = key(
+        "a table", "how the bytes of files without a format of their own are frames"
+    )
+    dark: Darks | None = key(
+        DARKS,
+        "frames without light; without it the level without light is part of the curves",
+    )
+    level: Annotated[list[Level], Field(min_length=1)] = needed("one or more tables [[level]]")
 
     @model_validator(mode="after")
     def _one_unit(self) -> Self:
@@ -305,11 +368,19 @@ class LevelManifest(Table):
 class Manifest(Table):
     """The whole experiment.toml."""
 
-    format: Literal[1] = 1
-    sensor: Sensor = Sensor()
-    layout: Layout | None = None
-    dark: Darks | None = None
-    exposure: Annotated[list[Exposure], Field(min_length=2)]
+    format: Literal[1] = _format()
+    sensor: Sensor = key("a table", default=Sensor())
+    layout: Layout | None = key(
+        "a table", "how the bytes of files without a format of their own are frames"
+    )
+    dark: Darks | None = key(
+        DARKS,
+        "one or several, of which each exposure takes the one that fits; only raw files of cameras "
+        "go without",
+    )
+    exposure: Annotated[list[Exposure], Field(min_length=2)] = needed(
+        "two or more tables [[exposure]]"
+    )
 
     @model_validator(mode="after")
     def _exposures_fit_together(self) -> Self:
@@ -327,10 +398,12 @@ class Manifest(Table):
         names = [exposure.name for exposure in self.exposure]
         if repeated := [name for name in names if names.count(name) > 1]:
             raise _problem(f"two exposures have the name '{repeated[0]}'")
-        for key in ("flux", "flux_std", "time"):
-            missing = [each.name for each in self.exposure if getattr(each, key) is None]
+        for column in ("flux", "flux_std", "time"):
+            missing = [each.name for each in self.exposure if getattr(each, column) is None]
             if missing and len(missing) < len(names):
-                raise _problem(f"'{key}' is missing in exposure '{missing[0]}': give all or none")
+                raise _problem(
+                    f"'{column}' is missing in exposure '{missing[0]}': give all or none"
+                )
         return self
 
     @property
@@ -342,17 +415,27 @@ class Manifest(Table):
 class Series(Table):
     """Frames with light, and as many without: ``[spatial]`` of a camera.toml."""
 
-    frames: Files
-    dark: Files
+    frames: Files = needed(
+        FILES,
+        "two or more with light; of `[spatial]` 100 or more, half saturated",
+        "bright/000-*.png",
+    )
+    dark: Files = needed(
+        FILES, "as many without light, of the same exposure time", "dark/000-*.png"
+    )
 
 
 class CameraExposure(Series):
     """One ``[[exposure]]`` of a camera.toml: a level of light, and its dark."""
 
-    name: str = ""
-    exposure_s: NotNegative
-    photons: NotNegative | None = None
-    irradiance_uw_cm2: NotNegative | None = None
+    name: str = key("a text", "name of the level, for messages", "level 0", "")
+    exposure_s: NotNegative = needed("a number of seconds, not negative", "exposure time", 0.001)
+    photons: NotNegative | None = key(
+        "a number of photons per pixel, not negative", "light within the exposure time", 120
+    )
+    irradiance_uw_cm2: NotNegative | None = key(
+        "a number of µW/cm², not negative", "irradiance, in the place of `photons`", 0.3
+    )
 
     @model_validator(mode="after")
     def _one_light(self) -> Self:
@@ -364,27 +447,38 @@ class CameraExposure(Series):
 class CameraLight(Table):
     """Table ``[light]``: what turns an irradiance into photons per pixel."""
 
-    wavelength_nm: Positive
-    pixel_um: Positive
+    wavelength_nm: Positive = needed("a positive number of nanometres", "its wavelength", 530)
+    pixel_um: Positive = needed(
+        "a positive number of micrometres", "side of a pixel, or root of its area", 5.5
+    )
 
 
 class CameraManifest(Table):
     """The whole camera.toml."""
 
-    format: Literal[1] = 1
-    sensor: Sensor = Sensor()
-    layout: Layout | None = None
-    light: CameraLight | None = None
-    exposure: Annotated[list[CameraExposure], Field(min_length=2)]
-    spatial: Series | None = None
+    unused: ClassVar = ("saturation", "gain_dn_per_e", "mask", "region")
+    """Keys of ``[sensor]`` that it does not have."""
+
+    format: Literal[1] = _format()
+    sensor: Sensor = key("a table", default=Sensor())
+    layout: Layout | None = key(
+        "a table", "how the bytes of files without a format of their own are frames"
+    )
+    light: CameraLight | None = key("a table", "what turns an irradiance into photons")
+    exposure: Annotated[list[CameraExposure], Field(min_length=2)] = needed(
+        "two or more tables [[exposure]]"
+    )
+    spatial: Series | None = key(
+        "a table", "frames for DSNU and PRNU, which are left out without them"
+    )
 
     @model_validator(mode="after")
     def _figures_of_all_pixels(self) -> Self:
-        for key in ("saturation", "gain_dn_per_e", "mask", "region"):
-            if getattr(self.sensor, key) is not None:
+        for name in self.unused:
+            if getattr(self.sensor, name) is not None:
                 raise _problem(
-                    f"'{key}' in [sensor] is not for a camera.toml: the figures are of all pixels, "
-                    "and gain and saturation are measured"
+                    f"'{name}' in [sensor] is not for a camera.toml: the figures are of all "
+                    "pixels, and gain and saturation are measured"
                 )
         if self.light is None and any(each.photons is None for each in self.exposure):
             raise _problem(
@@ -407,6 +501,37 @@ class CameraManifest(Table):
 AnyManifest = Manifest | LevelManifest | CameraManifest
 
 
+def table_of(kind: Any, *, many: bool = False) -> tuple[type[Table], bool] | None:
+    """Return the table that a key of this type holds, and whether it holds a list of them."""
+    if isinstance(kind, type) and issubclass(kind, Table):
+        return kind, many
+    parts = (table_of(each, many=many or get_origin(kind) is list) for each in get_args(kind))
+    return next(filter(None, parts), None)
+
+
+def keys_of(model: type[Table], within: str = "") -> Iterator[tuple[str, FieldInfo]]:
+    """Give all keys of a file with their descriptions, those in tables after that of the table."""
+    for name, field in model.model_fields.items():
+        yield within + name, field
+        if table := table_of(field.annotation):
+            for path, inner in keys_of(table[0], f"{within}{name}."):
+                if path.removeprefix("sensor.").split(".")[0] not in getattr(model, "unused", ()):
+                    yield path, inner
+
+
+def example_of(field: FieldInfo) -> Any:
+    """Return the example of a key."""
+    return (field.examples or [None])[0]
+
+
+KEYS = frozenset(
+    path.rsplit(".", 1)[-1]
+    for model in (Manifest, LevelManifest, CameraManifest)
+    for path, _ in keys_of(model)
+)
+"""All keys and tables of the manifests."""
+
+
 def read_manifest(path: Path, model: type[_Content]) -> _Content:
     """Read and check the experiment.toml, levels.toml or camera.toml `path`."""
     try:
@@ -426,7 +551,7 @@ def checked_content(path: Path, content: dict[str, Any], model: type[_Content]) 
     try:
         return model.model_validate(content)
     except ValidationError as error:
-        raise FileError(f"{path}: {'; '.join(_problems(error.errors(), content))}") from None
+        raise FileError(f"{path}: {'; '.join(_problems(error.errors(), content, model))}") from None
 
 
 def entry_files(path: Path, entry: Files, layout: Layout | None = None) -> list[Path]:
@@ -447,9 +572,11 @@ def _problem(text: str) -> PydanticCustomError:
     return PydanticCustomError("manifest", "{text}", {"text": text})
 
 
-def _problems(details: list[ErrorDetails], content: dict[str, Any]) -> list[str]:
-    """Name each mistake once, with the number of exposures that share it."""
-    found: dict[tuple[object, ...], dict[int | None, str]] = {}
+def _problems(
+    details: list[ErrorDetails], content: dict[str, Any], model: type[Table]
+) -> list[str]:
+    """Name each mistake once, with the number of exposures that share it, and the remedy."""
+    found: dict[tuple[object, ...], dict[int | None, tuple[str, str]]] = {}
     for detail in details:
         location = detail["loc"]
         exposure = next((part for part in location if isinstance(part, int)), None)
@@ -457,36 +584,51 @@ def _problems(details: list[ErrorDetails], content: dict[str, Any]) -> list[str]
         kinds = {"manifest": detail["msg"], "extra_forbidden": "unknown", "missing": "missing"}
         depth = 3 if names[:2] == ["sensor", "region"] else 2
         mistake = (kinds.get(detail["type"], "value"), *names[:depth])
-        found.setdefault(mistake, {}).setdefault(exposure, _sentence(detail, content))
+        found.setdefault(mistake, {}).setdefault(exposure, _sentence(detail, content, model))
     sentences = [list(alike.values()) for alike in found.values()]
     return [
-        first + (f", and likewise in {len(others)} more" if others else "")
-        for first, *others in sentences
+        first + (f", and likewise in {len(others)} more" if others else "") + remedy
+        for (first, remedy), *others in sentences
     ]
 
 
-def _sentence(detail: ErrorDetails, content: dict[str, Any]) -> str:
-    """One of pydantic's errors in the terms of the file."""
+def _sentence(detail: ErrorDetails, content: dict[str, Any], model: type[Table]) -> tuple[str, str]:
+    """One of pydantic's errors in the terms of the file, and what to do about it."""
     location = detail["loc"]
     place = _place(location, content)
+    named, wanted, owner = _described(model, location)
     if detail["type"] == "manifest":
-        return detail["msg"] + place
+        return detail["msg"] + place, ""
     if detail["type"] == "extra_forbidden":
-        hint = ""
-        if str(location[-1]).startswith(("shift", "position")):
-            hint = ": 'shift' is in pixels: divide micrometres by the pixel pitch"
-        return f"unknown key '{location[-1]}'{place}{hint}"
+        unknown = str(location[-1])
+        return f"unknown key '{unknown}'{place}", _nearest(unknown, owner)
     if detail["type"] == "missing":
-        return f"key '{location[-1]}' is missing{place}"
+        return f"key '{location[-1]}' is missing{place}", ""
     value = detail["input"]
-    key = next((key for key in reversed(location) if key in _WANTED), None)
-    if key is None:
-        named = next(part for part in reversed(location) if isinstance(part, str))
-        wanted = detail["msg"].replace("Input should be", "expected")
-        return f"'{named}'{place} holds {value!r}, {wanted}"
-    if key in ("exposure", "level") and isinstance(value, dict):
-        return f"[{key}] is one table: write [[{key}]], with two brackets, for each {key}"
-    return f"'{key}'{place} holds {value!r}, expected {_WANTED[key]}"
+    if named in ("exposure", "level") and isinstance(value, dict):
+        return f"[{named}] is one table: write [[{named}]], with two brackets, for each {named}", ""
+    return f"'{named}'{place} holds {value!r}, expected {wanted}", ""
+
+
+def _described(model: type[Table], location: tuple[object, ...]) -> tuple[str, str, type[Table]]:
+    """Return the key that a location ends in, what it must hold, and the table around it."""
+    named = wanted = ""
+    for part in location:
+        field = model.model_fields.get(str(part))
+        if field is not None:
+            named, wanted = str(part), field.title or ""
+            model, _ = table_of(field.annotation) or (model, False)
+    return named, wanted, model
+
+
+def _nearest(unknown: str, table: type[Table]) -> str:
+    """Name the known key that an unknown one is nearest to."""
+    if "shift" in table.model_fields and unknown.startswith(("shift_", "position")):
+        return ": 'shift' is in pixels: divide micrometres by the pixel pitch"
+    near = get_close_matches(unknown, table.model_fields, 1)
+    return (
+        f": did you mean '{near[0]}'?" if near else f": known are {', '.join(table.model_fields)}"
+    )
 
 
 def _place(location: tuple[int | str, ...], content: dict[str, Any]) -> str:

@@ -31,7 +31,7 @@ from typing import Annotated, Any, ClassVar, TypeVar
 
 import numpy as np
 
-from equipix._check import Array, Floats, ReadOnly
+from equipix._check import LOG, Array, Floats, ReadOnly
 from equipix._native import __version__
 from equipix.errors import FileError, InputError
 from equipix.io.formats import load_pages, refuse_copy, save_pages
@@ -124,6 +124,7 @@ class Record(Shown, ReadOnly):
         content = {"kind": self.KIND, "version": self.VERSION, "equipix": __version__}
         metadata = content | {"fields": fields}
         save_pages(path, held.by_name, metadata, viewed, force=force)
+        LOG.info("wrote %s: %s", path, self.KIND)
 
 
 Kind = TypeVar("Kind", bound=Record)
@@ -154,6 +155,7 @@ def read_record(path: str | PathLike[str], *kinds: type[Kind]) -> Kind:
     arrays, content = load_pages(path)
     wanted = {each.KIND: each for each in kinds}
     kind = str(content.get("kind"))
+    LOG.info("read %s: %s", path, kind)
     if kind not in wanted:
         raise FileError(
             f"{path}: holds {kind}, expected {' or '.join(wanted)} that equipix has saved: name "

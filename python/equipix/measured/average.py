@@ -13,6 +13,7 @@ import numpy as np
 
 from equipix import _native
 from equipix._check import (
+    LOG,
     Array,
     ArrayLike,
     Progress,
@@ -140,6 +141,9 @@ def average(
         # A saved average brings its own.
         metadata = statistics.metadata or made(options=options, started=started)
         found = dataclasses.replace(_subtract(statistics, offset), metadata=metadata)
+        shape, level, less = found.mean.shape, found.saturation, "no" if dark is None else "its"
+        text = "averaged %d frames of %d × %d pixels, saturation level %s, %s dark subtracted"
+        LOG.info(text, found.count.max(), *shape, level, less)
         return _masked(found, as_mask(mask, found.mean.shape))
 
 
@@ -173,6 +177,8 @@ def _paths_or_frames(source: Any) -> list[Any] | Array | Iterator[Any]:
 
 def _average_files(names: list[Any], how: _How) -> FrameStatistics:
     paths = find_files(names)
+    LOG.info("files to average: %d, the first %s", len(paths), paths[0])
+    LOG.debug("reads %s", ", ".join(map(str, paths)))
     if any(path.suffix.lower() in ONLY_RESULTS for path in paths):
         return _saved(paths, how)
     if how.rejection is None and all(map(is_image, paths)):

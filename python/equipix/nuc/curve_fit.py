@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from equipix._check import Array, Bools, By, Floats, Order, naming_memory, positive_workers
+from equipix._check import LOG, Array, Bools, By, Floats, Order, naming_memory, positive_workers
 from equipix.findings import ask, say, set_bits, usable
 from equipix.io.record import made, now
 from equipix.measured.means import Averaged
@@ -152,8 +152,10 @@ def fitted(
         if order == "auto":
             orders = [chosen_order(part, by, workers=workers) for _, part in parts]
             chosen, options["prediction_errors"] = max(orders, key=lambda each: each[0])
+            LOG.info("order %d predicts held-out levels best", chosen)
         else:
             chosen = int(order)
+        LOG.info("fits %d levels of %d × %d pixels by order %d", len(given), *given.shape, chosen)
         for _, part in parts:
             check_count(part, chosen)
             if chosen == 0 and by == "gain":

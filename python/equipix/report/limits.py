@@ -1,6 +1,5 @@
 """Limits on the figures of results: PASS or FAIL."""
 
-import json
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -8,7 +7,8 @@ from typing import Annotated, Any, NamedTuple
 
 from pydantic import Field, FiniteFloat
 
-from equipix.experiment.manifest import Table, read_manifest
+from equipix.experiment.manifest import Table, example_of, key, keys_of, read_manifest
+from equipix.experiment.templates import template
 from equipix.findings import Finding, Severity
 
 AtMost = FiniteFloat | None
@@ -20,41 +20,45 @@ Between = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)] | None
 SEVERITIES: tuple[Severity, ...] = ("note", "warning", "failure")
 
 
-def _limit(usual: Any, words: str) -> Any:
-    """Give a limit that is not set, with its usual value and what it is, for the template."""
-    return Field(default=None, examples=[usual], description=words)
+_BETWEEN = "[low, high], two numbers"
+
+_SEVEREST = "note, warning or failure"
 
 
 class Limits(Table):
     """Limits of any result."""
 
-    flagged_share: AtMost = _limit(0.01, "largest share of pixels that must not be used")
-    findings: Severity | None = _limit("note", "severest finding: note, warning or failure")
+    flagged_share: AtMost = key("a number", "largest share of pixels that must not be used", 0.01)
+    findings: Severity | None = key(_SEVEREST, "severest finding that passes", "note")
 
 
 class CalibrationLimits(Limits):
     """Limits of a calibration."""
 
-    sensitivity_std: AtMost = _limit(0.005, "largest median standard deviation of M")
-    tilt_std: AtMost = _limit(0.005, "largest standard deviation of the tilt, edge to edge")
-    reduced_chi2: Between = _limit([0.8, 1.3], "mean square residual over that of noise")
-    error_estimate: AtMost = _limit(1e-4, "largest estimated error of the solver")
-    converged: bool | None = _limit(True, "whether the solver must reach its tolerance")
+    sensitivity_std: AtMost = key("a number", "largest median standard deviation of M", 0.005)
+    tilt_std: AtMost = key(
+        "a number", "largest standard deviation of the tilt, edge to edge", 0.005
+    )
+    reduced_chi2: Between = key(_BETWEEN, "mean square residual over that of noise", [0.8, 1.3])
+    error_estimate: AtMost = key("a number", "largest estimated error of the solver", 1e-4)
+    converged: bool | None = key(
+        "true or false", "whether the solver must reach its tolerance", True
+    )
 
 
 class ResponseLimits(Limits):
     """Limits of response curves."""
 
-    reduced_chi2: Between = _limit([0.8, 1.3], "median misfit over that of noise")
-    largest_inverse_error: AtMost = _limit(1.0, "largest error of the inverse, in DN")
+    reduced_chi2: Between = key(_BETWEEN, "median misfit over that of noise", [0.8, 1.3])
+    largest_inverse_error: AtMost = key("a number of DN", "largest error of the inverse", 1.0)
 
 
 class LimitsFile(Table):
     """The whole limits.toml: a table for each kind of result."""
 
-    calibration: CalibrationLimits = CalibrationLimits()
-    response: ResponseLimits = ResponseLimits()
-    correction: Limits = Limits()
+    calibration: CalibrationLimits = key("a table", default=CalibrationLimits())
+    response: ResponseLimits = key("a table", default=ResponseLimits())
+    correction: Limits = key("a table", default=Limits())
 
 
 def read_limits(path: Path | None) -> LimitsFile:
@@ -105,10 +109,9 @@ def _words(value: Any) -> str:
 
 def limits_template() -> str:
     """Text of a limits.toml with usual limits, each with what it means."""
-    lines = ["# Limits for equipix report --limits: a figure without one may be anything."]
-    for kind, table in LimitsFile():
-        lines += ["", f"[{kind}]"]
-        for name, field in type(table).model_fields.items():
-            usual = json.dumps((field.examples or [None])[0])
-            lines.append(f"{name} = {usual}  # {field.description}")
-    return "\n".join(lines) + "\n"
+    usual: dict[str, dict[str, Any]] = {}
+    for path, field in keys_of(LimitsFile):
+        table, _, name = path.partition(".")
+        usual.setdefault(table, {}).update({name: example_of(field)} if name else {})
+    title = "Limits for equipix report --limits: a figure without one may be anything."
+    return template(LimitsFile, title, usual)

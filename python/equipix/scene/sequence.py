@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from equipix._check import Array, Progress, check_progress
+from equipix._check import LOG, Array, Progress, check_progress
 from equipix.correction.correct_files import warn_of_corrected
 from equipix.errors import FileError, InputError
 from equipix.findings import Findings
@@ -90,6 +90,7 @@ def run_sequence(
     headers = raw_headers(files, method.shape)
     said = warn_of_corrected(headers, "")
     record = _Record(sum(header.shape[0] for header in headers.values()))
+    LOG.info("learns from %d frames in %d files", record.total, len(files))
     frames = _corrected(method, files, record, progress)
     if output is None:
         for _ in frames:

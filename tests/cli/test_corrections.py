@@ -1,0 +1,206 @@
+"""The commands combine, lens and bolometer do what Python does."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import bolometer, lens, simulate
+from equipix.io.frames import read_frames
+from equipix.io.tiff import write_frames
+
+SHAPE = (48, 64)
+NOISE = 3.0
+
+
+def write(path, light, count=16):
+    """Write frames of 12 bits with noise."""
+    rng = np.random.default_rng(int(np.mean(light)))
+    frames = np.rint(light + NOISE * rng.standard_normal((count, *np.shape(light))))
+    write_frames(path, frames.clip(0, 4095).astype(np.uint16), nbytes=2 * frames.size)
+    return path
+
+
+@pytest.mark.parametrize("command", ["combine", "lens", "bolometer", "init"])
+def test_help_has_an_example(run, command):
+    status, out, _ = run(command, "--help")
+    assert status == 0
+    assert f"Example: equipix {command} " in out
+
+
+class TestCombine:
+    @pytest.mark.parametrize("dark", [True, False])
+    def test_old_curves_and_the_shutter_of_today(self, run, tmp_path, monkeypatch, dark):
+        """The recipe of docs/infrared.md, as it stands there."""
+        monkeypatch.chdir(tmp_path)
+        rng = np.random.default_rng(1)
+        gain, offset = 1 + 0.05 * rng.standard_normal(SHAPE), 200 + 20 * rng.standard_normal(SHAPE)
+        drift = 15 * rng.standard_normal(SHAPE)
+        text = "[sensor]\nbit_depth = 12\n"
+        for level in (500, 1500, 3000):
+            write(tmp_path / f"{level}.tif", offset + gain * level)
+            text += f'[[level]]\nframes = "{level}.tif"\n'
+        if dark:
+            write(tmp_path / "dark.tif", offset)
+            text += '[dark]\nframes = "dark.tif"\n'
+        (tmp_path / "levels.toml").write_text(text)
+        assert run("nuc", "fit", "levels.toml", "-o", "curves.tif")[0] == 0
+        write(tmp_path / "shutter.tif", offset + drift + gain * 1000)
+        write(tmp_path / "raw.tif", offset + drift + gain * 2000)
+        (tmp_path / "today.toml").write_text('[[level]]\nframes = "flat.tif"\n')
+        assert run("correct", "curves.tif", "shutter.tif", "-o", "flat.tif")[0] == 0
+        assert run("nuc", "fit", "today.toml", "--order", "0", "-o", "today.tif")[0] == 0
+        status, out, err = run("combine", "curves.tif", "today.tif", "-o", "now.tif", "--json")
+        assert (status, err) == (0, "")
+        assert json.loads(out)["order"] == 1
+        spread = {}
+        for name in ("curves", "now"):
+            assert run("correct", f"{name}.tif", "raw.tif", "-o", f"by-{name}.tif")[0] == 0
+            spread[name] = read_frames(f"by-{name}.tif").mean(axis=0).std()
+        assert spread["curves"] > 14
+        # Two means of 16 frames, and the curves' error, which is less.
+        assert spread["now"] < NOISE * np.sqrt(3 / 16) * (1 + 3 / np.sqrt(2 * gain.size))
+        inputs = equipix.load("now.tif").metadata["inputs"]
+        assert {"curves.tif", "today.tif"} <= set(inputs)
+
+    def test_is_what_python_combines(self, run, tmp_path):
+        ramp = np.linspace(0.9, 1.1, 24).reshape(4, 6)
+        levels = [equipix.average((level * ramp)[None]) for level in (100.0, 1000.0)]
+        first = equipix.nuc.fit(levels)
+        then = equipix.Polynomial(np.stack([0 * ramp, ramp]), np.zeros((4, 6), np.uint32))
+        first.save(tmp_path / "a.npz")
+        then.save(tmp_path / "b.npz")
+        out = tmp_path / "c.npz"
+        assert run("combine", tmp_path / "a.npz", tmp_path / "b.npz", "-o", out)[0] == 0
+        wanted = equipix.combine(first, then)
+        assert equipix.load(out).coefficients.tobytes() == wanted.coefficients.tobytes()
+
+    def test_refuses_what_python_refuses(self, run, tmp_path):
+        for name, size in (("a", 4), ("b", 5)):
+            flat = equipix.Polynomial(np.ones((2, size, 6)), np.zeros((size, 6), np.uint32))
+            flat.save(tmp_path / f"{name}.npz")
+        out = tmp_path / "c.npz"
+        status, printed, err = run("combine", tmp_path / "a.npz", tmp_path / "b.npz", "-o", out)
+        assert (status, printed) == (1, "")
+        assert "'first' is of shape (4, 6), 'then' of (5, 6)" in err
+        assert not out.exists()
+
+
+class TestLens:
+    @pytest.fixture
+    def light(self):
+        rows, cols = np.mgrid[:120, :160]
+        return 3000 * (1 + ((rows - 62) ** 2 + (cols - 75) ** 2) / 300**2) ** -2.0
+
+    def test_is_what_python_fits(self, run, tmp_path, light):
+        flat, dark = (
+            write(tmp_path / "flat.tif", light + 100),
+            write(tmp_path / "dark.tif", 0 * light + 100),
+        )
+        out = tmp_path / "lens.tif"
+        status, printed, err = run("lens", flat, "--dark", dark, "-o", out, "--json")
+        assert (status, err) == (0, "")
+        told = json.loads(printed)
+        mean = equipix.average(flat, dark=equipix.average(dark)).mean
+        found = lens.fit(mean)
+        assert (told["law"], told["findings"]) == ("cos4", [])
+        assert told["focal_length"] == found.focal_length
+        assert told["std"] == found.std
+        assert told["focal_length"] == pytest.approx(300, abs=5 * found.std["focal_length"])
+        saved = equipix.load(out)
+        assert saved.coefficients.tobytes() == found.correction().coefficients.tobytes()
+        assert len(saved.metadata["inputs"]) == 2
+
+    def test_a_flat_without_a_dark_is_a_finding(self, run, tmp_path, light):
+        flat, out = write(tmp_path / "flat.tif", light + 100), tmp_path / "lens.tif"
+        status, printed, err = run("lens", flat, "-o", out, "--law", "radial", "--json")
+        assert status == 0
+        assert err.startswith("equipix: warning: no dark was subtracted")
+        assert [each["kind"] for each in json.loads(printed)["findings"]] == ["raw"]
+        assert [each.kind for each in equipix.load(out).findings] == ["raw"]
+        assert {"k1", "k2"} <= set(json.loads(printed))
+
+    def test_the_gain_of_the_sensor_is_taken_out(self, run, tmp_path, light):
+        rng = np.random.default_rng(1)
+        gain = 1 + 0.1 * rng.standard_normal(light.shape)
+        shifts = equipix.cross_pattern(5, 7)
+        beam = simulate.gaussian_beam(light.shape)
+        cal = equipix.calibrate(simulate.exposures(gain, beam, shifts), shifts)
+        cal.save(tmp_path / "cal.tif")
+        np.save(tmp_path / "flat.npy", light * gain)
+        out, given = tmp_path / "lens.tif", ("--sensitivity", tmp_path / "cal.tif")
+        assert run("lens", tmp_path / "flat.npy", "-o", out, *given)[0] == 0
+        assert equipix.load(out).metadata["focal_length"] == pytest.approx(300, rel=1e-3)
+        assert len(equipix.load(out).metadata["inputs"]) == 2
+
+
+CELSIUS = (-20.0, 0.0, 20.0, 40.0, 60.0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A file for each state of a shutter and of two black bodies."""
+    folder = tmp_path_factory.mktemp("bolometer")
+    array = simulate.BolometerArray.of((24, 32), rng=1)
+    for k, celsius in enumerate(CELSIUS):
+        for name, scene in (("shutter", None), ("cold", 0.0), ("hot", 40.0)):
+            np.save(folder / f"{name}{k}.npy", array.mean(celsius, scene_c=scene))
+    return folder
+
+
+class TestBolometer:
+    def command(self, folder, out, *more, celsius="-20 0 20, 40 60"):
+        files = sorted(folder.glob("shutter*.npy"))
+        return ("bolometer", *files, "--substrate-c", celsius, "--bias-v", "2", "-o", out, *more)
+
+    def test_is_what_python_fits(self, run, folder, tmp_path):
+        out = tmp_path / "dynamic.npz"
+        bodies = ("--cold", folder / "cold*.npy", "--hot", folder / "hot*.npy", "--order", "2")
+        status, printed, err = run(*self.command(folder, out, *bodies, "--json"))
+        assert (status, err) == (0, "")
+        stacks = [
+            [equipix.average(folder / f"{name}{k}.npy") for k in range(5)]
+            for name in ("shutter", "cold", "hot")
+        ]
+        wanted = bolometer.fit(
+            stacks[0], CELSIUS, 2.0, black_bodies=(stacks[1], stacks[2]), order=2
+        )
+        saved = equipix.load(out)
+        for name in ("offset", "gain", "level"):
+            assert getattr(saved, name).tobytes() == getattr(wanted, name).tobytes()
+        told = json.loads(printed)
+        assert [each["substrate_c"] for each in told["states"]] == list(CELSIUS)
+        assert told["states"][3]["shutter"] == str(folder / "shutter3.npy")
+        assert saved.metadata["states"] == told["states"]
+        assert len(saved.metadata["inputs"]) == 15
+
+    def test_chooses_the_order(self, run, folder, tmp_path):
+        out = tmp_path / "dynamic.npz"
+        assert run(*self.command(folder, out, "--regressor", "inverse"))[0] == 0
+        assert equipix.load(out).axes.regressor == "inverse"
+        assert equipix.load(out).gain is None
+
+    @pytest.mark.parametrize(
+        ("more", "celsius", "words"),
+        [
+            ((), "0 20", "--substrate-c has 2 entries, expected 5"),
+            ((), "warm", "--substrate-c is 'warm', expected numbers such as '0 20 40'"),
+            ((), "", "--substrate-c is '', expected numbers"),
+            (("--cold", "cold0.npy"), "-20 0 20 40 60", "--cold and --hot give the gain together"),
+            (("--order", "high"), "-20 0 20 40 60", "--order is 'high', expected 0 to"),
+        ],
+    )
+    def test_refuses(self, run, folder, tmp_path, more, celsius, words):
+        out = tmp_path / "dynamic.npz"
+        status, printed, err = run(*self.command(folder, out, *more, celsius=celsius))
+        assert (status, printed) == (1, "")
+        assert words in err
+        assert not out.exists()
+
+    def test_a_file_of_two_states_is_refused(self, run, folder, tmp_path):
+        one, out = folder / "shutter0.npy", tmp_path / "dynamic.npz"
+        given = ("--substrate-c", "0 20", "--bias-v", "2", "-o", out)
+        assert "is named twice" in run("bolometer", one, one, *given)[2]
