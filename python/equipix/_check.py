@@ -11,6 +11,7 @@ import numpy.typing as npt
 from numpy.typing import NDArray
 
 from equipix.errors import InputError, InsufficientMemoryError
+from equipix.shown import Brief
 
 ArrayLike: TypeAlias = npt.ArrayLike
 
@@ -50,7 +51,7 @@ Order = Literal[0, 1, 2, 3, "auto"]
 """Order of response curves, or that which predicts a held-out level best."""
 
 
-class ReadOnly:
+class ReadOnly(Brief):
     """Base of frozen dataclasses whose arrays are read-only.
 
     They are views: nothing is copied, and an array that the caller made stays writeable.
