@@ -7,9 +7,8 @@ import typer
 
 from equipix.cli import terminal
 from equipix.errors import EquipixError, InputError
-from equipix.io.paths import write_whole
 from equipix.report.limits import limits_template, read_limits
-from equipix.report.page import page, part_of
+from equipix.report.page import page, part_of, write_page
 from equipix.saved_results import load
 
 commands = typer.Typer()
@@ -38,7 +37,7 @@ def report(
 ) -> None:
     """Write results as one page, judged by limits."""
     if limits_template_ is not None:
-        _write(limits_template_, limits_template(), force=force)
+        write_page(limits_template_, limits_template(), force=force)
         terminal.show_result({"output": str(limits_template_)}, as_json=as_json)
         return
     if not results or output is None:
@@ -49,14 +48,9 @@ def report(
     wanted = read_limits(limits)
     parts = [part_of(str(file), load(file), wanted, share=len(results)) for file in results]
     title = f"Report of {results[0].name}" if len(results) == 1 else f"{len(results)} results"
-    _write(output, page(parts, title), force=force)
+    write_page(output, page(parts, title), force=force)
     verdicts = {part.name: part.verdict or "not judged" for part in parts}
     terminal.show_result({"output": str(output), "verdicts": verdicts}, as_json=as_json)
     failed = [part.name for part in parts if part.verdict == "FAIL"]
     if check and failed:
         raise EquipixError(f"beyond the limits of {limits}: {', '.join(failed)}")
-
-
-def _write(path: Path, text: str, *, force: bool) -> None:
-    with write_whole(path, force=force) as temporary:
-        temporary.write_text(text, encoding="utf-8")
