@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import html
 import json
+import re
+from statistics import NormalDist
 
 import numpy as np
 import pytest
 
 import equipix
 from equipix import cli, errors, simulate
+from equipix.comparison import _student_quantile
 from equipix.pictures import draw_comparison
 
 SHAPE = (96, 128)
@@ -208,3 +212,132 @@ def test_the_command_line_compares_files(experiments, tmp_path, capsys):
     with pytest.raises(SystemExit) as done:
         cli.main(["compare", *files])
     assert "16×16" in capsys.readouterr().out
+
+
+SMALL = (48, 64)
+BEAM = simulate.gaussian_beam(SMALL, width=100)
+TRUTH = simulate.cosine_sensitivity(SMALL, rng=1)
+
+
+def nine(first, second):
+    """Two crosses with one middle."""
+    return np.vstack([equipix.cross_pattern(*first), equipix.cross_pattern(*second)[1:]])
+
+
+PATTERNS = (
+    *(equipix.cross_pattern(*arms) for arms in ((5, 7), (7, 11), (3, 8), (6, 13))),
+    *(nine((5, 7), (11, 13)), nine((4, 9), (10, 14))),
+)
+
+
+def measured(seed, pattern, *, known=True, moved=0.0, lamp=0.0, noise=NOISE):
+    """A calibration with error bars; one shift and the lamp may be other than is told."""
+    shifts, rng = PATTERNS[pattern], np.random.default_rng([3, seed])
+    true = shifts.astype(float)
+    true[3, 1] += moved
+    frames = simulate.exposures(TRUTH, BEAM, true) * (1 + lamp * shifts[:, 1, None, None])
+    frames += noise * rng.standard_normal(frames.shape)
+    variance = np.full(len(shifts), NOISE**2) if known else None
+    return equipix.calibrate(frames, shifts, variance=variance, uncertainty=True)
+
+
+@pytest.mark.study
+def test_noise_alone_rarely_makes_a_difference(draws, figure):
+    seeds, false, times = draws(200), 0, []
+    for seed in seeds:
+        first, second = seed % 6, (seed + 1 + seed // 6 % 5) % 6
+        pair = [measured(2 * seed, first, known=seed % 2), measured(2 * seed + 1, second)]
+        result = equipix.compare(pair)
+        times.append([each.times for each in result.checks[0][:3]])
+        false += result.verdicts[0] != "agree within their noise"
+    figure(f"verdicts against {len(seeds)} right pairs", false, "at most 1 %")
+    assert false <= 0.01 * len(seeds)
+    # The rms over 3072 pixels scatters by 1.3 %, and its map is exact to 2 %; tilts are normal,
+    # but where a drift is added to their error bars.
+    assert np.mean([each[0] for each in times]) == pytest.approx(1, abs=0.01)
+    assert np.sqrt(np.mean(np.square([each[1:] for each in times]))) < 1.2
+
+
+@pytest.mark.study
+@pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
+@pytest.mark.parametrize(
+    ("wrong", "what"),
+    [
+        ({"moved": 0.5}, "pixels without tilt"),
+        ({"lamp": 3e-5}, "tilt along columns"),
+        ({"noise": 1.3 * NOISE}, "pixels without tilt"),
+    ],
+    ids=["a shift by half a pixel", "the lamp by 3e-5 a pixel of the stage", "noise of 1.3 times"],
+)
+def test_errors_of_one_experiment_are_seen(draws, figure, wrong, what):
+    """With nine exposures; a tilt of 3e-5 a pixel is 1.9e-3 from edge to edge."""
+    seeds, seen = draws(20), 0
+    for seed in seeds:
+        pair = [measured(900 + seed, 4), measured(950 + seed, 5, **wrong)]
+        (verdict,) = equipix.compare(pair).verdicts
+        seen += verdict.startswith("differ by more than their noise") and what in verdict
+    figure(f"differences by {what} seen in {len(seeds)}", seen, "all")
+    assert seen == len(seeds)
+
+
+def test_the_verdict_has_a_rule(tmp_path):
+    """Limits of the rms follow from the degrees of freedom, those of tilts from their law."""
+    pair = [measured(1, 4), measured(2, 5)]
+    pixels, *tilts, blocks = equipix.compare(pair).checks[0]
+    assert [each.what for each in tilts] == ["tilt along rows", "tilt along columns"]
+    # Four checks share 1 %: normal for both sides of a tilt; the map is exact to 2 %.
+    for each in tilts:
+        assert each.high == pytest.approx(NormalDist().inv_cdf(1 - 0.0025 / 2), rel=1e-6)
+    sigmas = NormalDist().inv_cdf(1 - 0.0025 / 2)
+    exactness = pair[0].metadata["uncertainty"]["relative_standard_error"]
+    least = sigmas * np.hypot(exactness, 1 / np.sqrt(2 * TRUTH.size))
+    assert least < pixels.high - 1 < 1.5 * least
+    assert blocks.what == "16×16 means, rms"
+    for number, each in enumerate(pair):
+        each.save(tmp_path / f"{number}.npz")
+    read = equipix.compare([equipix.load(tmp_path / f"{k}.npz") for k in range(2)])
+    assert [each.what for each in read.checks[0]] == [pixels.what, *(each.what for each in tilts)]
+    same = equipix.compare([pair[0], pair[0]])
+    assert same.verdicts[0].startswith("agree better than their noise: pixels without tilt")
+    assert len(repr(same)) <= 120
+
+
+@pytest.mark.parametrize(
+    ("freedom", "quantile"), [(0, 2.5758), (1, 63.657), (2, 9.9248), (6, 3.7074), (30, 2.7500)]
+)
+def test_quantiles_are_those_of_tables(freedom, quantile):
+    """Of Student's t at 0.995; of the normal distribution for a freedom of 0."""
+    assert _student_quantile(0.995, freedom) == pytest.approx(quantile, rel=2e-5)
+
+
+def test_a_page_and_words_have_the_verdict(tmp_path, run):
+    files = [tmp_path / f"{name}.tif" for name in ("one", "other", "tilted", "plain")]
+    calibrations = [measured(1, 4), measured(2, 5), measured(3, 5, lamp=3e-5)]
+    calibrations.append(dataclasses.replace(calibrations[0], sensitivity_std=None, tilt_std=None))
+    calibrations[3] = dataclasses.replace(
+        calibrations[3], sensitivity=calibrations[1].sensitivity[::-1]
+    )
+    for file, each in zip(files, calibrations, strict=True):
+        each.save(file)
+    page = tmp_path / "page.html"
+    status, out, err = run("compare", *files[:3], "-o", page)
+    assert (status, err) == (0, "")
+    assert f"{files[0]} − {files[1]}: agree within their noise\n" in out
+    assert re.search(r"other\.tif − .*tilted\.tif: differ by more .*: tilt along columns \d", out)
+    assert re.search(
+        r"pixels without tilt, rms +\d\S+e-04 +\d\S+e-04 +\d\S* +0\.9\d+ to 1\.0\d+", out
+    )
+    text = html.unescape(page.read_text(encoding="utf-8"))
+    for words in (
+        *("Agree within their noise.", 'aria-label="Difference: single pixels', "PASS", "FAIL"),
+        *("Difference, 16×16 means", "Scatter of the sensitivities", "Histogram of difference"),
+        *("Spectrum of difference", "largest of a pixel"),
+    ):
+        assert words in text
+    found = json.loads(run("compare", files[0], files[3], "--json")[1])
+    assert found["pairs"][0]["verdict"].startswith("not judged: no standard deviations")
+    assert found["pairs"][0]["checks"] == []
+    assert run("compare", *files[:2], "-o", tmp_path / "page.htm")[0] == 1
+    result = equipix.compare(calibrations[:2])
+    assert len(result.plot().axes) > 5
+    assert "agree within their noise" in result._repr_html_()

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from numpy.typing import NDArray
 
 from equipix.errors import InputError, InsufficientMemoryError
+from equipix.shown import Brief
 
 LOG = logging.getLogger("equipix")
 """Tells the steps of the work: at INFO what a user may want to see, at DEBUG more."""
@@ -56,7 +57,7 @@ Order = Literal[0, 1, 2, 3, "auto"]
 """Order of response curves, or that which predicts a held-out level best."""
 
 
-class ReadOnly:
+class ReadOnly(Brief):
     """Base of frozen dataclasses whose arrays are read-only.
 
     They are views: nothing is copied, and an array that the caller made stays writeable.

@@ -3,22 +3,50 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from statistics import NormalDist
+from typing import NamedTuple
 
 import numpy as np
 
-from equipix._check import Array, ArrayLike, Bools, Ints, as_array, check_count
+from equipix._check import Array, ArrayLike, Bools, Floats, Ints, as_array, check_count
 from equipix.calibration.result import Calibration
 from equipix.errors import InputError
 from equipix.findings import determined, usable
 from equipix.measured.noise import BLOCK
-from equipix.metrics.maps import block_means, relative_error, rms
+from equipix.metrics.correctability import fisher_quantile
+from equipix.metrics.maps import block_means, relative_error, rms, slope_pixels, tilt
+from equipix.shown import Brief, Shown
+
+_FALSE = 0.01
+"""Probability that noise alone fails one of the checks of a pair, which have even shares of it."""
+
+_EXACT = 1e-4
+"""Least relative standard error of what is predicted."""
+
+_LEAST = 1e-9
+"""Least λ(q): that of a wave which no exposure determines."""
 
 _MOST_BLOCKS = 16
 """Blocks whose uncertainty represents all: each takes about as long as a calibration."""
 
 
+class Check(NamedTuple):
+    """A difference, what uncertainties predict, and the ratios between which noise leaves both."""
+
+    what: str
+    found: float
+    predicted: float
+    low: float
+    high: float
+
+    @property
+    def times(self) -> float:
+        """Found over predicted."""
+        return self.found / self.predicted
+
+
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class Comparison(Brief, Shown):
     """Agreement of several calibrations of one sensor: the result of `compare`.
 
     Attributes
@@ -40,6 +68,9 @@ class Comparison:
         their ratio is no difference, and is left out of all figures.
     predicted_rms, predicted_block_rms : ndarray, shape (pairs,), float64, or None
         What the uncertainties of two independent calibrations predict for `rms` and `block_rms`.
+    checks : tuple of tuple of Check
+        Of each pair what is judged: ``what``, ``found``, ``predicted``, and between which ratios
+        ``low`` and ``high`` of both noise leaves it. Empty where nothing is predicted.
     """
 
     sensitivities: Array
@@ -51,6 +82,12 @@ class Comparison:
     open_tilt: Bools
     predicted_rms: Array | None = None
     predicted_block_rms: Array | None = None
+    checks: tuple[tuple[Check, ...], ...] = ()
+
+    @property
+    def verdicts(self) -> tuple[str, ...]:
+        """Of each pair whether it agrees within the noise of both, by the rule of `compare`."""
+        return tuple(map(_verdict, self.checks))
 
     def difference(self, pair: int) -> Array:
         """Relative difference of the sensitivities of a pair, (M₁ − M₂)/M₂, shape (rows, cols).
@@ -94,6 +131,20 @@ def compare(
     dominates the block means. A tilt that free fluxes leave undetermined is no difference, and is
     left out (`Comparison.open_tilt`).
 
+    `Comparison.verdicts` judges each pair. Found over predicted must lie between limits that noise
+    alone crosses in at most 1 % of the pairs; each check has an even share of it:
+
+    - The rms over pixels, without the tilt. Its square over the predicted one follows Fisher's
+      distribution. Errors of waves of M have variances 1/λ(q) (`equipix.plan.error_budget`), so
+      the found one has (Σ 1/λ)²/Σ 1/λ² degrees of freedom. Error bars with a relative standard
+      error e (``metadata["uncertainty"]``) have 1/(2e²). Both calibrations are taken to have waves
+      and draws in common, which widens the limits.
+    - The tilt along rows and along columns, over `tilt_std` and the solver errors of both, by the
+      normal distribution. Where the drift of a lamp is part of `tilt_std`, by Student's t with its
+      degrees of freedom.
+    - The rms of block means, upwards, where it is predicted and no drift of a lamp is part of it.
+      That of 16 blocks has 16 degrees of freedom; that of `predicted` counts as exact.
+
     References
     ----------
     .. [1] S. E. Stukachev, I. E. Kozhevatov, "Calibration method for spatial distribution of light
@@ -135,6 +186,8 @@ def compare(
     compared = sensitivities
     if is_open.any():
         compared = np.stack([_levelled(each, sensitivities[0]) for each in sensitivities])
+    expected = _expected(calibrations) if predicted is None else predicted
+    predictions = _predictions(expected, pairs, count)
     return Comparison(
         sensitivities=sensitivities,
         agreement=compared.std(axis=0, ddof=1),
@@ -143,8 +196,139 @@ def compare(
         rms=np.array([rms(each) for each in differences]),
         block_rms=np.array([rms(block_means(each)) for each in differences]),
         largest=np.array([np.nanmax(np.abs(each)) for each in differences]),
-        **_predictions(_expected(calibrations) if predicted is None else predicted, pairs, count),
+        checks=tuple(
+            ()
+            if expected is None
+            else _checks(
+                [calibrations[k] for k in pair],
+                sensitivities[pair],
+                differences[number],
+                np.square(np.asarray(expected, np.float64)[pair]),
+                told=predicted is not None,
+            )
+            for number, pair in enumerate(pairs)
+        ),
+        **predictions,
     )
+
+
+def _verdict(checks: tuple[Check, ...]) -> str:
+    """Words on the checks of a pair."""
+    if not checks:
+        return "not judged: no standard deviations (calibrate with --uncertainty)"
+    for words, failed in (
+        ("differ by more than their noise", [c for c in checks if c.times > c.high]),
+        ("agree better than their noise", [c for c in checks if c.times < c.low]),
+    ):
+        if failed:
+            told = (
+                f"{c.what} {c.times:.3g} times as predicted (limits {c.low:.3g} to {c.high:.3g})"
+                for c in failed
+            )
+            return f"{words}: {', '.join(told)}"
+    return "agree within their noise"
+
+
+def _checks(
+    pair: Sequence[Calibration], maps: Array, difference: Array, variances: Array, *, told: bool
+) -> tuple[Check, ...]:
+    """Judge a pair by the rule of `compare`.
+
+    `variances` are those expected of each in pixels and in block means, `told` by the caller.
+    """
+    drifts = [c.drift.degrees_of_freedom for c in pair if c.drift is not None and c.drift.is_added]
+    tilts = np.square([np.zeros(2) if c.tilt_std is None else c.tilt_std for c in pair])
+    judged = np.flatnonzero((np.isfinite(tilts) & (tilts > 0)).all(axis=0))
+    blocks = bool(np.isfinite(variances[:, 1]).all()) and not drifts
+    tail = _FALSE / (1 + len(judged) + blocks)
+    evenness, exactness, predicted, pixels = 1.0, _EXACT, variances[:, 0], difference
+    if not told:
+        pixels = _difference(maps[0], maps[1], True)
+        predicted, exactness, evenness = _of_bars(pair, np.isfinite(pixels))
+    found = evenness * _freedom(pair, predicted, without_tilt=not told)
+    limits = (fisher_quantile(p, found, 0.5 / exactness**2) for p in (tail / 2, 1 - tail / 2))
+    what = "pixels, rms" if told else "pixels without tilt, rms"
+    checks = [
+        Check(what, rms(pixels), float(predicted.sum()) ** 0.5, *(each**0.5 for each in limits))
+    ]
+    if len(judged):
+        count = [slope_pixels(each.sensitivity, each.flags) for each in pair]
+        slopes = np.abs(tilt(maps[0] / maps[1], np.isfinite(pixels) & count[0] & count[1]))
+        std = np.sqrt(tilts.sum(axis=0) + sum(each.error_estimate**2 for each in pair))
+        limit = _student_quantile(1 - tail / 2, min(drifts, default=0))
+        for axis in judged:
+            name = f"tilt along {('rows', 'columns')[axis]}"
+            checks.append(Check(name, float(slopes[axis]), float(std[axis]), 0.0, limit))
+    if blocks:
+        means = rms(block_means(difference))
+        found = _freedom(pair, variances[:, 1], without_tilt=False, side=BLOCK)
+        limit = fisher_quantile(1 - tail, found, 0.5 / _EXACT**2 if told else _MOST_BLOCKS)
+        expected = float(variances[:, 1].sum()) ** 0.5
+        checks.append(Check("16×16 means, rms", means, expected, 0.0, limit**0.5))
+    return tuple(checks)
+
+
+def _of_bars(pair: Sequence[Calibration], known: Bools) -> tuple[Floats, float, float]:
+    """Variances of both without their tilts, by their error bars over known pixels.
+
+    Beside them the relative standard error of the root of their sum, and the share of pixels that
+    would scatter as much if all had the same variance.
+    """
+    maps, variances, exactness = np.zeros(known.sum()), [], []
+    # Mean square of a plane whose tilt is 1 from edge to edge: a twelfth where all are known.
+    spread = np.var(np.nonzero(known), axis=1) / np.square(known.shape)
+    for each in pair:
+        std, drift = each.sensitivity_std, each.drift
+        assert std is not None
+        variance = np.square(std[known].astype(np.float64) / each.sensitivity[known])
+        tilts = np.zeros(2) if each.tilt_std is None else np.square(each.tilt_std)
+        if drift is not None and drift.is_added:
+            variance -= drift.variance_map(each.sensitivity)[known]
+            tilts = tilts - np.square(drift.tilt_std)
+        maps += variance
+        of_tilt = (spread * tilts)[np.isfinite(tilts)].sum()
+        variances.append(max(variance.mean() - of_tilt, _EXACT * variance.mean()))
+        exactness.append(each.metadata["uncertainty"]["relative_standard_error"])
+    shares = np.array(variances)
+    common = float(shares @ exactness / shares.sum())
+    return shares, max(common, _EXACT), float(maps.mean() ** 2 / np.mean(maps**2))
+
+
+def _freedom(
+    pair: Sequence[Calibration], variances: Floats, *, without_tilt: bool, side: int = 1
+) -> float:
+    """Degrees of freedom of the mean square of two errors, of pixels or of means over blocks."""
+    # Tr (C₁ + C₂)² is largest where both have their waves in common.
+    roots = [v / _waves(c, without_tilt, side) ** 0.5 for c, v in zip(pair, variances, strict=True)]
+    return float(variances.sum() / sum(roots)) ** 2
+
+
+def _waves(calibration: Calibration, without_tilt: bool, side: int) -> float:
+    """Find (Σ 1/λ)²/Σ 1/λ² over waves of whole numbers of half periods along rows and columns."""
+    count, sums = len(calibration.shifts), np.zeros(2)
+    down, right = (
+        np.exp(1j * np.pi * np.outer(np.arange(-(-size // side)) / size, along))
+        for size, along in zip(calibration.shape, calibration.shifts.T, strict=True)
+    )
+    for number, row in enumerate(down):
+        # cos · cos is two waves, of both signs along the columns.
+        shared = (np.abs(right @ row) ** 2 + np.abs(right @ row.conj()) ** 2) / (2 * count)
+        # The mean is no wave; the first ones are the tilt.
+        errors = 1 / np.maximum(count - shared, _LEAST)[max(0, 1 + without_tilt - number) :]
+        sums += errors.sum(), errors @ errors
+    return float(sums[0] ** 2 / sums[1])
+
+
+def _student_quantile(probability: float, freedom: int) -> float:
+    """Quantile of Student's t above the median; of the normal distribution for a freedom of 0."""
+    if not freedom:
+        return NormalDist().inv_cdf(probability)
+    # With t = √f tan θ the density of θ is cos^(f − 1) θ.
+    angles = np.linspace(0, np.pi / 2, 100_001)
+    density = np.cos(angles) ** (freedom - 1)
+    area = np.concatenate([[0], np.cumsum(density[1:] + density[:-1])])
+    angle = np.interp(2 * probability - 1, area / area[-1], angles)
+    return float(np.sqrt(freedom) * np.tan(angle))
 
 
 def _leaves_tilt(calibration: Calibration) -> bool:

@@ -12,6 +12,7 @@ from equipix.experiment.experiment import Experiment
 from equipix.exposures.spots import cross_pattern
 from equipix.measured.average import average
 from equipix.metrics.maps import relative_error, rms_at_both_scales
+from equipix.shown import Brief
 from equipix.simulate.beams import cosine_sensitivity, gaussian_beam
 from equipix.simulate.camera import Camera
 from equipix.simulate.rig import VirtualExperiment, experiment
@@ -34,7 +35,7 @@ SOURCE_UNEVENNESS = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Demo:
+class Demo(Brief):
     """Errors of a calibration and of a flat field against the same truth.
 
     Attributes

@@ -11,6 +11,7 @@ import numpy as np
 
 from equipix import errors
 from equipix._check import Array, Bools, Floats
+from equipix.shown import Brief
 
 Concern = Literal["input", "identifiability", "misfit", "convergence"]
 """What a finding concerns: the values given, what they determine, the model, or the solver."""
@@ -30,7 +31,7 @@ _Evidence = TypeVar("_Evidence")
 
 
 @dataclass(frozen=True)
-class Finding:
+class Finding(Brief):
     """A finding that limits a result.
 
     Attributes

@@ -1,9 +1,57 @@
 """What can be looked at: results that draw themselves, and show themselves in notebooks."""
 
+from dataclasses import fields
 from importlib import import_module
 from typing import Any
 
+import numpy as np
+
 from equipix.errors import EquipixError, InputError
+
+_LONGEST = 100
+"""Characters of a short form, from which on fields are left out."""
+
+_WORD = 40
+"""Characters of a text in it."""
+
+
+class Brief:
+    """Base of dataclasses whose ``__repr__`` is a short form, unless they have one of their own."""
+
+    __slots__ = ()
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Set it before the decorator of dataclasses does."""
+        super().__init_subclass__(**options)
+        if "__repr__" not in vars(cls):
+            cls.__repr__ = _short  # type: ignore[method-assign]
+
+
+def _short(self: Any) -> str:
+    """Names and values of the first fields, in a line."""
+    text = f"<{type(self).__name__}"
+    for number, each in enumerate(fields(self)):
+        more = f"{',' if number else ':'} {each.name} {_brief(getattr(self, each.name))}"
+        if len(text) + len(more) > _LONGEST:
+            return f"{text}, …>"
+        text += more
+    return f"{text}>"
+
+
+def _brief(value: Any) -> str:
+    """A value in few characters: at most four digits, the shape of an array, else its type."""
+    match value:
+        case bool() | int() | None:
+            return str(value)
+        case float():
+            return f"{value:.4g}"
+        case np.ndarray():
+            return f"of shape {value.shape}"
+        case str():
+            return repr(value if len(value) <= _WORD else f"{value[: _WORD - 1]}…")
+        case tuple() if all(isinstance(item, int | float) for item in value):
+            return f"({', '.join(map(_brief, value))})"
+    return type(value).__name__
 
 
 class Shown:

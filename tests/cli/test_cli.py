@@ -138,7 +138,42 @@ def test_inspect_shows_the_calibration(run, calibration):
     assert re.search(r"orientation +the data do not determine.*compare the axes of the stage", out)
     _, out, _ = run("inspect", calibration, "--json")
     assert json.loads(out)["shift_sign"] == "undetermined"
-    assert json.loads(out)["metadata"]["sensor"]["bit_depth"] == 12
+    told, saved = json.loads(out), equipix.load(calibration)
+    assert told["metadata"]["sensor"]["bit_depth"] == 12
+    assert told["sensitivity_mean"] == pytest.approx(1)
+    assert [each["shift"] for each in told["exposures"]] == saved.shifts.tolist()
+    assert told["exposures"][0] | {"flux": 1} == {
+        "exposure": "p0", "shift": saved.shifts[0].tolist(), "shift_std": None, "flux": 1
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("count", [5, 13])
+def test_shifts_are_printed_with_their_standard_deviations(run, tmp_path, count):
+    rng = np.random.default_rng(1)
+    shifts = np.rint(12 * rng.random((count, 2))) + 0.5 * np.eye(count, 2)
+    frames = simulate.exposures(np.ones((32, 40)), simulate.gaussian_beam((32, 40)), shifts)
+    found = equipix.calibrate(
+        frames + 1e-3 * rng.standard_normal(frames.shape),
+        shifts,
+        shift_std=0.02,
+        variance=np.full(count, 1e-6),
+        uncertainty=True,
+    )
+    found.save(tmp_path / "cal.tif")
+    out = run("inspect", tmp_path / "cal.tif")[1]
+    listed = re.findall(
+        r"^ +(\d+) +(-?\d+\.\d{4} ± 0\.\d{4}), (-?\d+\.\d{4} ± 0\.\d{4}) +1", out, re.M
+    )
+    told = json.loads(run("inspect", tmp_path / "cal.tif", "--json")[1])["exposures"]
+    assert [each["shift_std"] for each in told] == found.shift_std.tolist()
+    if count > 12:
+        assert not listed
+        assert re.search(r"\nexposures +13: --json and equipix report list them\n", out)
+    else:
+        assert "pixels" in out
+        (row, std), (col, _) = (each.split(" ± ") for each in listed[1][1:])
+        assert (float(row), float(col)) == pytest.approx(found.shifts[1], abs=5e-5)
+        assert float(std) == pytest.approx(found.shift_std[1, 0], abs=5e-5)
 
 
 @pytest.mark.parametrize("weights", ["equal", "variances"])
@@ -180,7 +215,7 @@ def test_inspect_shows_an_average(run, experiment, tmp_path):
     assert told["mean"] == pytest.approx(equipix.load(mean).mean.mean())
     assert "saturated pixels" in run("inspect", mean)[1]
     run("average", frames, "-o", mean, "--force")
-    assert re.search(r"\nsaturation +65535\n", run("inspect", mean)[1])
+    assert re.search(r"\nsaturation +65535 DN\n", run("inspect", mean)[1])
 
 
 def test_a_file_is_not_averaged_twice(run, experiment, tmp_path):
@@ -235,7 +270,7 @@ def test_what_an_average_does_not_determine_is_said_in_words(run, tmp_path):
     status, out, _ = run(*command)
     assert status == 0
     rows = dict(re.split("  +", line, maxsplit=1) for line in out.splitlines())
-    assert (rows["variance"], rows["saturation"]) == ("not determined", "none")
+    assert (rows["variance of a frame"], rows["saturation"]) == ("not determined", "none")
     assert rows["findings"] == "none"
     told = json.loads(run(*command, "--json", "--force")[1])
     assert (told["variance"], told["saturation"]) == (None, None)

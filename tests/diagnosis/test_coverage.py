@@ -9,7 +9,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from equipix.cli.summary import summary
 
 import equipix
 from equipix import cli, errors, simulate
@@ -19,6 +18,7 @@ from equipix.exposures.exposures import Exposures
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Positions
 from equipix.measured.measured import measured_of
+from equipix.report.figures import summary
 from given import written_experiment
 
 SHAPE, CROSS = (40, 50), equipix.cross_pattern(5, 7)

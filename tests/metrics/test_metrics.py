@@ -10,7 +10,7 @@ import pytest
 import equipix
 from equipix import errors, metrics, nuc
 from equipix.io.frames import read_frames
-from equipix.metrics.correctability import _fisher_quantile
+from equipix.metrics.correctability import fisher_quantile
 from equipix.metrics.emva import high_passed, split_variances
 from equipix.metrics.frame_noise import Moments, temporal_of
 from equipix.simulate import StaringArray
@@ -160,7 +160,7 @@ class TestCorrectability:
     )
     def test_quantiles_are_those_of_the_tables(self, probability, degrees, quantile, error):
         # The error of Paulson's approximation falls as the square of the degrees of freedom.
-        assert _fisher_quantile(probability, *degrees) == pytest.approx(quantile, rel=error)
+        assert fisher_quantile(probability, *degrees) == pytest.approx(quantile, rel=error)
 
     @pytest.mark.parametrize(
         ("given", "message"),

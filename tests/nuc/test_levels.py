@@ -234,7 +234,7 @@ class TestCommands:
         assert json.loads(run("inspect", output, "--json")[1])["order"] == wanted.order
         status, out, _ = run("nuc", "fit", folder / "levels.toml", "-o", output, "--force")
         assert status == 0
-        assert "spread of K" in out
+        assert "spread of the gain deviation K" in out
 
     def test_by_gain(self, run, folder, tmp_path):
         output = tmp_path / "response.npz"
@@ -273,7 +273,7 @@ class TestCommands:
         two = text.split("[[level]]")
         (tmp_path / "levels.toml").write_text("[[level]]".join(two[:3]), encoding="utf-8")
         status, out, _ = run(*given)
-        assert "reduced chi2           not determined" in out
+        assert re.search(r"reduced χ² +not determined\n", out)
         assert json.loads(run(*given, "--json")[1])["reduced_chi2"] is None
 
     def test_errors_are_one_line(self, run, folder, tmp_path):
@@ -342,6 +342,26 @@ class TestDefectsAndQuality:
         noise = metrics.three_d_noise(replaced)
         assert told["noise_variances"] == pytest.approx(vars(noise))
         assert told["roughness"] == pytest.approx(metrics.roughness(replaced.mean(axis=0)))
+
+    def test_quality_has_a_verdict(self, run, array, saved, folder, tmp_path):
+        _, path = saved
+        fresh = tmp_path / "fresh.tif"
+        write_frames(fresh, array.frames(LIGHT[1], 16, rng=50), nbytes=1)
+        command = ("nuc", "quality", path)
+        told = json.loads(run(*command, fresh, "--confidence", "0.999", "--json")[1])
+        assert told["C_from"] < told["C_predicted"] < told["C_to"]
+        assert told["verdict"] == "the pattern is that of noise"
+        out = run(*command, fresh)[1]
+        assert re.search(r"\nspatial variance +\S+ DN²\n", out)
+        assert re.search(r"\nC predicted +0\.\d+\n", out)
+        # Frames of the fit have noise in common with it.
+        told = json.loads(run(*command, folder / "level2.tif", "--json")[1])
+        assert told["verdict"].startswith("the pattern is below that of noise: give frames that")
+        plain = tmp_path / "plain.npz"
+        coefficients = np.stack([np.zeros(SHAPE), np.ones(SHAPE)])
+        equipix.Polynomial(coefficients, np.zeros(SHAPE, np.uint32)).save(plain)
+        told = json.loads(run("nuc", "quality", plain, fresh, "--json")[1])
+        assert (told["C_predicted"], told["verdict"][:10]) == (None, "not judged")
 
     @pytest.mark.parametrize("command", ["defects", "quality"])
     def test_another_sensor_is_refused(self, run, saved, folder, command):

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import Flag, cli, errors, nuc
+from equipix import Flag, cli, errors, metrics, nuc, simulate
 from equipix.io.frames import read_frames, stream_frames
 from equipix.io.tiff import write_frames
+from equipix.nuc.response import pattern_variance
 from records import rewrite
 
 SHAPE = (24, 32)
@@ -46,6 +47,36 @@ def response(request, averages):
 
 def frames(count=3):
     return np.random.default_rng(2).integers(100, 3000, (count, *SHAPE), dtype=np.uint16)
+
+
+def test_the_pattern_that_noise_leaves_is_predicted():
+    """Order 2 leaves an InSb array noise alone; order 1 leaves its curvature, too."""
+    count, squares, predicted = 32, [], []
+    for seed in range(8):
+        array = simulate.StaringArray.of("InSb", (48, 64), rng=seed)
+        dark = equipix.average(array.frames(0, 16, rng=[seed, 9])) if seed % 2 else None
+        levels = [
+            equipix.average(array.frames(light, 16, rng=[seed, number]), dark=dark)
+            for number, light in enumerate((3e6, 6e6, 9e6, 12e6, 16e6))
+        ]
+        frames = list(array.frames(11e6, count, rng=[seed, 10]))
+        for order in (1, 2):
+            response = nuc.fit(levels, order=order)
+            found = metrics.correctability(response.correct(frames, flagged="nan"))
+            wanted = pattern_variance(response, found.level)
+            if order == 1:
+                assert found.low > (wanted / found.temporal_variance) ** 0.5
+            else:
+                squares.append(found.spatial_variance)
+                predicted.append(wanted)
+                error = wanted + found.temporal_variance / count
+    # Four standard errors of the mean of eight variances over 3072 pixels.
+    error *= 4 * (2 / 3072 / 8) ** 0.5
+    assert np.mean(squares) == pytest.approx(np.mean(predicted), abs=error)
+    by_gain = nuc.fit([each.mean for each in levels], order=0, by="gain")
+    assert np.isnan(pattern_variance(by_gain, 5000.0))
+    colours = nuc.fit(levels, cfa="RGGB")
+    assert np.isnan(pattern_variance(colours, 5000.0))
 
 
 class TestFile:

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import base64
 import html
+import inspect
 import json
 import re
 import tomllib
+from enum import Flag
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from report_results import calibration, every_kind, measured
+from report_results import calibration, every_kind, learned, measured
 
 import equipix
+from equipix import detector, hardware, lens, metrics, nuc, plan, simulate
 from equipix.errors import FileError
 from equipix.report.limits import LimitsFile, limits_template, read_limits
 from equipix.report.maps import Map, maps_of
 from equipix.report.page import page, part_of
+from equipix.scene.methods import METHODS
 from given import written_camera
 
 NOTHING = LimitsFile()
@@ -310,3 +314,61 @@ def test_curves_take_the_colour_of_the_text(results):
     for plot in part.plots:
         legend = plot["svg"].partition('id="legend')[2]
         assert "fill: #ffffff" not in legend
+
+
+def public_classes():
+    """Classes among the public names, but protocols and bits."""
+    public = [getattr(equipix, name) for name in equipix.__all__]
+    modules = [equipix, *filter(inspect.ismodule, public)]
+    found = [getattr(module, name) for module in modules for name in getattr(module, "__all__", ())]
+    return {
+        each
+        for each in filter(inspect.isclass, found)
+        if not issubclass(each, Exception | Flag) and each is not equipix.Correction
+    }
+
+
+def test_short_forms_are_a_line(results, tmp_path):
+    """Of each public class, and of what public functions give."""
+    cal, response, raw = results["calibration"], results["response"], measured(1500)
+    shape, shifts = (48, 64), equipix.cross_pattern(3, 5)
+    line = nuc.fit([equipix.average(measured(level)) for level in (500, 1500, 3000)])
+    truth = simulate.paper_sensitivity(shape, rng=1)
+    virtual = simulate.experiment(truth, simulate.gaussian_beam(shape), shifts, rng=2)
+    rows, cols = np.mgrid[:24, :32]
+    fallen = 1000 / (1 + ((rows - 12.0) ** 2 + (cols - 15.0) ** 2) / 60.0**2) ** 2
+    disc = 1000.0 * (np.hypot(rows - 12, cols - 15) < 6)
+    band = detector.HgCdTe(start_um=3.0, cutoff_um=5.1)
+    manifest = virtual.write(tmp_path / "experiment")
+    camera = equipix.CameraExperiment.load(written_camera(tmp_path, count=6))
+    figures = camera.figures()[""]
+    (tmp_path / "levels.toml").write_text(
+        "".join(f'[[level]]\nframes = "experiment/frames/p{k}.tif"\n' for k in range(2))
+    )
+    shown = [
+        *results.values(),
+        *(learned(name) for name in METHODS),
+        *(cal.orientation, cal.drift, *cal.findings, equipix.compare([cal, cal])),
+        *(equipix.Corrector(response), nuc.DefectLimits(), nuc.find_defects(response, raw)),
+        *(metrics.correctability(raw), metrics.three_d_noise(raw)),
+        *(metrics.emva_spatial(raw, measured(0)), metrics.emva_spatial(raw, measured(0)).dsnu),
+        *(equipix.NoiseModel(read_noise=3.123456789, gain=1 / 7), lens.fit(fallen)),
+        *(plan.error_budget(shape, shifts, noise=1e-3), plan.identify(shape, shifts)),
+        *(plan.suggest(shape, 5, (9, 9), noise=1e-3, rng=1)[0], equipix.measure_shift(disc, disc)),
+        *(virtual, virtual.camera, virtual.truth, simulate.MovingScene(seed=1, shape=shape)),
+        simulate.StaringArray.of("InSb", shape, rng=1),
+        simulate.BolometerArray.of(shape, rng=1),
+        *(band, detector.ShortPass(edge_um=5.0), detector.composition_tolerance(band)),
+        *(hardware.AdaptiveLoop((8, 8)), hardware.quality(line, raw), camera),
+        hardware.smallest_widths(line, [raw]),
+        *(figures, figures.transfer, equipix.Experiment.load(manifest)),
+        equipix.LevelExperiment.load(tmp_path / "levels.toml"),
+    ]
+    assert public_classes() <= {type(each) for each in shown}
+    for each in shown:
+        text = repr(each)
+        assert len(text) <= 120, text
+        assert "\n" not in text
+        assert " at 0x" not in text
+        for number in re.findall(r"\d+\.\d+", text):
+            assert len(number.replace(".", "").lstrip("0")) <= 5, text

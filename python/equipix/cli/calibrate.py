@@ -18,7 +18,8 @@ from equipix.io.paths import refuse_inputs
 from equipix.io.record import read_record
 from equipix.pictures import check_picture, draw_comparison, save_figure
 from equipix.report.drawing import draw_result
-from equipix.report.figures import summary
+from equipix.report.figures import COMPARED, rows_of, summary
+from equipix.report.page import comparison_parts, page, write_page
 from equipix.saved_results import READ, load
 
 commands = typer.Typer()
@@ -97,40 +98,49 @@ def compare(
     calibrations: Annotated[
         list[Path], typer.Argument(help="Calibrations of one sensor: .tif or .npz.")
     ],
-    output: terminal.Picture = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="A page: .html, or a picture: .png, .pdf or .svg."),
+    ] = None,
     force: terminal.Force = False,
     as_json: terminal.Json = False,
 ) -> None:
     """Show how far calibrations of one sensor agree."""
-    check_picture(output)
+    is_page = output is not None and output.suffix.lower() == ".html"
+    if not is_page:
+        check_picture(output)
     terminal.check_output(output, calibrations, force=force)
     loaded = [read_record(file, Calibration) for file in calibrations]
     _refuse_equal(calibrations, loaded)
     result = compare_calibrations(loaded)
-    if output is not None:
-        names = [file.stem for file in calibrations]
-        save_figure(draw_comparison(result, names), output, force=force)
+    names = [str(file) for file in calibrations]
+    if output is not None and is_page:
+        text = page(comparison_parts(result, names, loaded), "Calibrations compared")
+        write_page(output, text, force=force)
+    elif output is not None:
+        stems = [file.stem for file in calibrations]
+        save_figure(draw_comparison(result, stems), output, force=force)
     predicted = None if result.predicted_rms is None else result.predicted_rms.tolist()
     pairs: list[dict[str, Any]] = [
         {
-            "files": [str(calibrations[i]) for i in pair],
+            "files": [names[i] for i in pair],
             "rms": float(result.rms[k]),
             "block_rms": float(result.block_rms[k]),
             "largest": float(result.largest[k]),
             "tilt_compared": not result.open_tilt[k],
             "predicted_rms": predicted and predicted[k],
+            "verdict": result.verdicts[k],
+            "checks": [each._asdict() for each in result.checks[k]],
         }
         for k, pair in enumerate(result.pairs)
     ]
-    pixels = int(np.isfinite(result.agreement).sum())
+    pixels = summary(result)["pixels_compared"]
     if as_json:
         terminal.show_result({"pixels": pixels, "pairs": pairs}, as_json=True)
         return
-    figures = ("rms", "block_rms", "largest")
-    terminal.show_table(
-        ("relative difference", "pixels, rms", "16×16 means, rms", "largest"),
-        [(" − ".join(pair["files"]), *(f"{pair[name]:.2e}" for name in figures)) for pair in pairs],
-    )
+    for number, pair in enumerate(pairs):
+        print(f"{' − '.join(pair['files'])}: {pair['verdict']}")  # noqa: T201
+        terminal.show_table(COMPARED, rows_of(result, number))
     words: dict[str, Any] = {"pixels compared": pixels, "picture": str(output or "none")}
     if result.open_tilt.any():
         left_out = {calibrations[i] for pair in result.pairs[result.open_tilt] for i in pair}

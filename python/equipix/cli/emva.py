@@ -7,10 +7,10 @@ import typer
 
 from equipix.cli import terminal
 from equipix.experiment.camera import CameraExperiment
-from equipix.io.paths import refuse_inputs, write_whole
+from equipix.io.paths import refuse_inputs
 from equipix.report.camera import camera_parts, figures_of
 from equipix.report.figures import told
-from equipix.report.page import page
+from equipix.report.page import page, write_page
 
 commands = typer.Typer()
 
@@ -33,8 +33,7 @@ def emva(
         planes = loaded.figures(workers=workers, progress=progress)
     if output is not None:
         text = page(camera_parts(loaded.path.parent.resolve().name, planes), "Figures of a camera")
-        with write_whole(output, force=force) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        write_page(output, text, force=force)
     if as_json:
         result = {
             name: {each.key: each.value for each in figures_of(found)} | told(found.findings)

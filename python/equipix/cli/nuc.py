@@ -1,5 +1,6 @@
 """Commands about corrections with a uniform source: nuc fit, nuc defects, nuc quality."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
@@ -18,8 +19,9 @@ from equipix.io.paths import refuse_inputs
 from equipix.io.record import read_record
 from equipix.measured.colour import Colours
 from equipix.measured.defects import DefectLimits
+from equipix.metrics.correctability import Correctability
 from equipix.nuc.defect_search import find_defects
-from equipix.nuc.response import Response
+from equipix.nuc.response import Response, pattern_variance
 from equipix.report.figures import flagged as flag_counts
 from equipix.saved_results import READ, load_correction
 
@@ -114,7 +116,9 @@ def quality(
     sensor: terminal.Sensor = None,
     as_json: terminal.Json = False,
 ) -> None:
-    """Show spatial over temporal noise of corrected frames, and its parts.
+    """Show spatial over temporal noise of corrected frames, its parts, and what noise predicts.
+
+    The verdict says whether the predicted C lies in the confidence interval of C.
 
     Behind colour filters that of each plane: of the correction's, or of --cfa, where it names none.
     """
@@ -153,6 +157,7 @@ def _quality(
             "C": good.ratio,
             "C_from": good.low,
             "C_to": good.high,
+            **_judged(correction, good),
             "C_with_flagged_pixels": kept[name],
             "spatial_variance": good.spatial_variance,
             "temporal_variance": good.temporal_variance,
@@ -162,3 +167,20 @@ def _quality(
     }
     said = tuple(each for good in usable.values() for each in good.findings)
     return result[""] if colours is None else result, said
+
+
+def _judged(correction: Correction, found: Correctability) -> dict[str, Any]:
+    """C that the noise of the response predicts, and whether it lies in the interval of C."""
+    variance = math.nan
+    if isinstance(correction, Response):
+        variance = pattern_variance(correction, found.level)
+    predicted = math.sqrt(variance / found.temporal_variance)
+    if math.isnan(predicted):
+        words = "not judged: no noise is predicted for this correction (a response without filters)"
+    elif found.low > predicted:
+        words = "the pattern is above that of noise: see the misfit of the response, or fit again"
+    elif found.high < predicted:
+        words = "the pattern is below that of noise: give frames that the fit has not used"
+    else:
+        words = "the pattern is that of noise"
+    return {"C_predicted": predicted, "verdict": words}

@@ -9,10 +9,9 @@ from equipix.cli import terminal
 from equipix.errors import EquipixError, InputError
 from equipix.hardware.table import Table
 from equipix.io.formats import SUFFIXES
-from equipix.io.paths import write_whole
 from equipix.io.viewed import Use
 from equipix.report.limits import read_limits
-from equipix.report.page import page, part_of
+from equipix.report.page import page, part_of, write_page
 from equipix.saved_results import load
 from equipix.scene.scene_correction import SceneCorrection
 
@@ -41,9 +40,7 @@ def report(
     wanted = read_limits(limits)
     parts = [part_of(str(file), load(file), wanted, share=len(results)) for file in results]
     title = f"Report of {results[0].name}" if len(results) == 1 else f"{len(results)} results"
-    text = page(parts, title)
-    with write_whole(output, force=force) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_page(output, page(parts, title), force=force)
     verdicts = {part.name: part.verdict or "not judged" for part in parts}
     terminal.show_result({"output": str(output), "verdicts": verdicts}, as_json=as_json)
     failed = [part.name for part in parts if part.verdict == "FAIL"]

@@ -2,7 +2,6 @@
 
 import inspect
 import json
-import math
 import os
 import re
 import sys
@@ -26,14 +25,14 @@ from equipix.io.frames import read_frames
 from equipix.io.paths import find_files, refuse_inputs
 from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.response import Response
-from equipix.report.figures import summary, told
+from equipix.report.figures import pair_in_words, summary, told, words_of
 
 _Saved = Calibration | FrameStatistics | Polynomial | Response
 
 _NO_NUMBER = r"\(?-?\b(?:inf|nan)\b.*"
 
-_WHOLE = 1e9
-"""Whole numbers below this are printed with all digits, as saturation levels are."""
+_MOST_EXPOSURES = 12
+"""Most exposures that are printed."""
 
 
 @contextmanager
@@ -80,10 +79,21 @@ def show_result(result: dict[str, Any], found: Findings | None = None, *, as_jso
         # JSON has no NaN and no infinity: null is what is not determined.
         print(json.dumps(json.loads(json.dumps(result), parse_constant=lambda _: None)))  # noqa: T201
         return
-    width = max(map(len, result))
-    for name, value in result.items():
-        words = _words(value).replace("\n", "\n" + " " * (width + 2))
-        print(f"{name.replace('_', ' '):<{width}}  {words}")  # noqa: T201
+    exposures = result.get("exposures", [])
+    rows = words_of(result, without=("exposures",))
+    if len(exposures) > _MOST_EXPOSURES:
+        rows.append(("exposures", f"{len(exposures)}: --json and equipix report list them"))
+    width = max(len(name) for name, _ in rows)
+    for name, words in rows:
+        print(f"{name:<{width}}  {words}".replace("\n", "\n" + " " * (width + 2)))  # noqa: T201
+    if 0 < len(exposures) <= _MOST_EXPOSURES:
+        show_table(
+            ("exposure", "shift ± standard deviation (row, col), pixels", "flux"),
+            [
+                (e["exposure"], pair_in_words(e["shift"], e["shift_std"]), f"{e['flux']:.5g}")
+                for e in exposures
+            ],
+        )
 
 
 def show_saved(output: Path, result: _Saved, *, force: bool, as_json: bool) -> None:
@@ -202,37 +212,6 @@ def options_of(
         return command
 
     return declared
-
-
-def _figure(value: float, form: str) -> str:
-    """Write a number; what is none is not determined."""
-    return f"{value:{form}}" if math.isfinite(value) else "not determined"
-
-
-def _words(value: Any) -> str:
-    match value:
-        case bool():
-            return "yes" if value else "no"
-        case float():
-            return _figure(value, ".0f" if value.is_integer() and abs(value) < _WHOLE else ".4g")
-        case dict():
-            return ", ".join(f"{name} {_words(item)}" for name, item in value.items()) or "none"
-        case [] | () | None:
-            return "none"
-        case [dict(), *_]:
-            return "\n".join(map(_row, value))
-        case [float(), *_]:
-            return ", ".join(_figure(item, ".6g") for item in value)
-        case [str(), *_]:
-            return ", ".join(value)
-        case list() | tuple():
-            return " × ".join(str(item) for item in value)
-    return str(value)
-
-
-def _row(fields: dict[str, Any]) -> str:
-    """Words of a row: of a finding its kind and its message, else numbers with their names."""
-    return f"{fields['kind']}: {fields['message']}" if "kind" in fields else _words(fields)
 
 
 Force = Annotated[bool, typer.Option("--force", help="Replace an existing output.")]

@@ -8,6 +8,7 @@ from equipix._check import ArrayLike, Floats, number, positive
 from equipix.detector import photons
 from equipix.detector.photons import EV_UM, band_photons
 from equipix.errors import InputError
+from equipix.shown import Brief
 
 _TAIL = 30.0
 """Widths below the band gap at which the absorption edge ends: e⁻³⁰ of the response."""
@@ -23,7 +24,7 @@ _SLOPES = (0.005, 0.5)
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShortPass:
+class ShortPass(Brief):
     """Filter that transmits short wavelengths.
 
     Attributes
@@ -73,7 +74,7 @@ class ShortPass:
 
 
 @dataclass(frozen=True, kw_only=True)
-class HgCdTe:
+class HgCdTe(Brief):
     r"""Pixels of Hg₁₋ₓCdₓTe behind the optics that limit their band.
 
     Attributes

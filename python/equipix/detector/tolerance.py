@@ -10,6 +10,7 @@ from equipix._check import By, Floats, as_array, check_type, check_word, positiv
 from equipix.detector.material import HgCdTe
 from equipix.detector.photons import LARGEST_X, hgcdte_composition, hgcdte_cutoff
 from equipix.errors import InputError
+from equipix.shown import Brief
 
 _NODES = 16
 """Compositions of the Gauss-Legendre rule that stands for all pixels."""
@@ -22,7 +23,7 @@ _COLDEST_K = 100.0
 
 
 @dataclass(frozen=True)
-class Tolerance:
+class Tolerance(Brief):
     """Spread of composition that a correction tolerates, the result of `composition_tolerance`.
 
     Attributes

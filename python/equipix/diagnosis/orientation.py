@@ -20,6 +20,7 @@ from equipix.fitting.residuals import left_by
 from equipix.fitting.windows import WindowFit, if_there_is_light
 from equipix.measured.noise import chi2_tail
 from equipix.plan.drift import undetermined_fluxes
+from equipix.shown import Brief
 
 _MOST_EXPOSURES = 12
 """Most exposures of the test: each has a flux to be fitted."""
@@ -44,7 +45,7 @@ _REMEDY = (
 
 
 @dataclass(frozen=True)
-class OrientationTest:
+class OrientationTest(Brief):
     """Outcome of the comparison of orientations.
 
     Attributes

@@ -46,12 +46,13 @@ from equipix.measured.colour import Colours
 from equipix.measured.means import Averaged
 from equipix.measured.noise import NoiseModel
 from equipix.measured.statistics import FrameStatistics, refuse_subtracted
+from equipix.shown import Brief
 
 _Manifest = TypeVar("_Manifest", Manifest, LevelManifest, CameraManifest)
 
 
 @dataclass(frozen=True)
-class Described(Generic[_Manifest]):
+class Described(Brief, Generic[_Manifest]):
     """Images of a sensor as files on disk, and the file that describes them.
 
     Attributes

@@ -11,10 +11,11 @@ from equipix._check import Array, Bools, as_array, as_mask, is_whole
 from equipix.errors import InputError
 from equipix.exposures.positions import _BEYOND
 from equipix.measured.saturation import saturation_level
+from equipix.shown import Brief
 
 
 @dataclass(frozen=True, eq=False)
-class Spot:
+class Spot(Brief):
     """Where the image of a hole is on the sensor.
 
     Attributes
@@ -30,7 +31,7 @@ class Spot:
 
 
 @dataclass(frozen=True, eq=False)
-class ShiftMeasurement:
+class ShiftMeasurement(Brief):
     """A measured move of the sensor.
 
     Attributes

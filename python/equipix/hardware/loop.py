@@ -77,6 +77,11 @@ class AdaptiveLoop:
         self._gain = np.full(sizes, 2 ** (gain_bits - 1), np.uint16)
         self._offset = np.zeros(sizes, np.int16)
 
+    def __repr__(self) -> str:
+        """Short form: sizes and step."""
+        rows, cols = self._gain.shape
+        return f"<AdaptiveLoop of {rows} x {cols} pixels, step 2^-{self._step}>"
+
     @property
     def gain(self) -> Array:
         """Words of the gain, uint16: 1 is 2^(gain_bits − 1)."""

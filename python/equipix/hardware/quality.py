@@ -15,6 +15,7 @@ from equipix.findings import usable
 from equipix.hardware.table import Table
 from equipix.metrics import correctability
 from equipix.metrics.correctability import Correctability
+from equipix.shown import Brief
 
 _WIDTHS = range(8, 17)
 
@@ -23,7 +24,7 @@ _BOTH = 16
 
 
 @dataclass(frozen=True)
-class Quality:
+class Quality(Brief):
     """Quality C of a correction and of its table, the result of `quality`.
 
     Attributes
@@ -115,7 +116,7 @@ def _added(found: Array, exact: Array, before: Correctability) -> float:
 
 
 @dataclass(frozen=True)
-class Widths:
+class Widths(Brief):
     """Widths that suffice, the result of `smallest_widths`.
 
     Attributes

@@ -17,6 +17,7 @@ from equipix.measured.noise import (
     scatter_limit,
 )
 from equipix.measured.statistics import FrameStatistics, light_of
+from equipix.shown import Brief
 
 SIGMAS = 6.0
 """Standard deviations that noise does not reach on a sensor of some million pixels."""
@@ -474,7 +475,7 @@ def _median(values: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class DefectLimits:
+class DefectLimits(Brief):
     """Limits of `find_defects`, each adjustable.
 
     Attributes

@@ -32,6 +32,7 @@ import numpy as np
 
 from equipix._check import Array, ArrayLike, Floats, number, positive
 from equipix.errors import InputError
+from equipix.shown import Brief
 
 MEDIAN_SQUARE = 0.4549
 """Median of the square of a standard normal variable."""
@@ -59,7 +60,7 @@ _LEAST_V = 1e-8
 
 
 @dataclass(frozen=True)
-class NoiseModel:
+class NoiseModel(Brief):
     """Variance of a value as a function of its mean signal.
 
     Attributes

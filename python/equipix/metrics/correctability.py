@@ -9,10 +9,11 @@ from equipix._check import ArrayLike, Bools, Floats, as_array, as_mask, naming_m
 from equipix.errors import InputError
 from equipix.findings import Finding, ask, say
 from equipix.metrics.frame_noise import STEADY, signed_root, stack_of, temporal_of
+from equipix.shown import Brief
 
 
 @dataclass(frozen=True)
-class Correctability:
+class Correctability(Brief):
     """Spatial noise of corrected frames over their temporal noise, the result of `correctability`.
 
     Attributes
@@ -28,6 +29,8 @@ class Correctability:
         Variance of one frame, drift of the frame mean removed.
     pixels, frames : int
         Numbers that count.
+    level : float
+        Mean of the frames over these pixels.
     findings : tuple of Finding
         What limits the result, each also a warning.
     """
@@ -39,6 +42,7 @@ class Correctability:
     temporal_variance: float
     pixels: int
     frames: int
+    level: float
     findings: tuple[Finding, ...] = ()
 
 
@@ -131,10 +135,10 @@ def correctability(
     degrees = _freedom(found.mean, found.used), (pixels - 1) * (n - 1)
     tail = (1 - confidence) / 2
     low, high = (
-        signed_root((ratio / _fisher_quantile(p, *degrees) - 1) / n) for p in (1 - tail, tail)
+        signed_root((ratio / fisher_quantile(p, *degrees) - 1) / n) for p in (1 - tail, tail)
     )
     figures = signed_root(spatial / temporal), low, high, spatial, temporal, pixels, n
-    return Correctability(*figures, said)
+    return Correctability(*figures, float(found.mean[found.used].mean()), said)
 
 
 def validity_interval(times: ArrayLike, ratios: ArrayLike) -> float:
@@ -196,7 +200,7 @@ def _freedom(image: Floats, used: Bools) -> float:
     return total**2 / sum(square**2 / freedom for square, freedom in parts if freedom > 0)
 
 
-def _fisher_quantile(probability: float, first: float, second: float) -> float:
+def fisher_quantile(probability: float, first: float, second: float) -> float:
     """Quantile of F by Paulson's normal approximation, whose equation in F^(1/3) is quadratic."""
     z = NormalDist().inv_cdf(probability)
     a, b = 2 / (9 * first), 2 / (9 * second)

@@ -21,6 +21,7 @@ from equipix.errors import InputError
 from equipix.findings import Finding, say
 from equipix.measured.statistics import FrameStatistics
 from equipix.metrics.frame_noise import Moments, moments, signed_root
+from equipix.shown import Brief
 
 _BOXES = (7, 11)
 """Widths of the running means of the high-pass."""
@@ -34,9 +35,14 @@ class Split(NamedTuple):
     column: float
     pixel: float
 
+    def __repr__(self) -> str:
+        """Short form: the total and its parts."""
+        parts = (f"{name} {value:.4g}" for name, value in self._asdict().items())
+        return f"<Split: {', '.join(parts)}>"
+
 
 @dataclass(frozen=True)
-class EmvaSpatial:
+class EmvaSpatial(Brief):
     """Non-uniformity of a camera, the result of `emva_spatial`.
 
     Attributes
@@ -208,7 +214,7 @@ _TIMES = 3
 
 
 @dataclass(frozen=True)
-class EmvaTransfer:
+class EmvaTransfer(Brief):
     """Gain, noise and linearity of a camera, the result of `emva_transfer`.
 
     Attributes

@@ -10,6 +10,7 @@ from equipix._check import Array, ArrayLike, Bools, Floats, as_array, naming_mem
 from equipix.errors import InputError
 from equipix.findings import Finding, Rule, say
 from equipix.measured.statistics import FrameStatistics, refuse_subtracted
+from equipix.shown import Brief
 
 _SIGMAS = 6.0
 """Standard errors above chance from which noise is common to a line."""
@@ -183,7 +184,7 @@ def _of_average(name: str, frames: FrameStatistics) -> Moments:
 
 
 @dataclass(frozen=True)
-class ThreeDNoise:
+class ThreeDNoise(Brief):
     """Variances of the seven components of noise, the result of `three_d_noise`.
 
     Each is an unbiased estimate, which may be negative; in the square of the frames' unit.

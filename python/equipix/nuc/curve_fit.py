@@ -163,6 +163,7 @@ def fitted(
         options["weights"] = "equal" if given.level_noise is None else "variances"
         curves = [(pixels, _curves(part, chosen, by, workers)) for pixels, part in parts]
         metadata = made(options=options, started=started) | (provenance or {})
+        metadata["level_variances"] = given.variances.tolist()
         response = _response(given, _joined(curves), metadata)
         found = ask(INVERSE, response)
         # One point is right at one level, whatever the others are; "auto" judged them all.

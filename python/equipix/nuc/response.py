@@ -14,7 +14,7 @@ from equipix.findings import Findings, usable
 from equipix.io.record import Counts, Doubles, Map, Record
 from equipix.measured.colour import Colours
 from equipix.measured.noise import median_of_noise
-from equipix.nuc.curves import counted_from, exact_inverse, response_at
+from equipix.nuc.curves import counted_from, exact_inverse, response_at, slope_at
 
 _LARGEST = int(np.iinfo(np.uint32).max)
 """Largest number of the flags of a pixel."""
@@ -60,7 +60,8 @@ class Response(CorrectionBase, Record, kind="response", version=2):
         Level of saturation in DN, where it is known.
     metadata : dict
         Versions, options and times, as JSON values. With ``order="auto"`` the mean square error of
-        prediction of each order.
+        prediction of each order. ``level_variances`` are those of a value at each level, in DN²; 1
+        where no noise was known.
     cfa : Colours or None
         Colour filters of the pixels, where they were given.
     colour_response : dict of str to float, or None
@@ -238,6 +239,32 @@ class Response(CorrectionBase, Record, kind="response", version=2):
         said = tuple(dict.fromkeys(self.findings + findings))
         combined = self.flags | more.astype(np.uint32)
         return replace(self, flags=combined, metadata=metadata, findings=said)
+
+
+def pattern_variance(response: Response, level: float) -> float:
+    """Variance over pixels that the noise of the levels leaves in frames corrected at this V̄.
+
+    With x the powers of V̄ it is xᵀ C x over the square of the slope. C, the covariance of the
+    coefficients, is that of the weights of the levels, times what the variance of the highest
+    coefficient of a pixel says. The noise of a stored dark cancels. NaN behind colour filters,
+    whose levels are not stored, and for one point by gain, or by offset with a dark.
+    """
+    noise, order = response.metadata.get("level_variances"), response.order
+    one_point = response.metadata.get("options", {}).get("order") == 0
+    if (
+        noise is None
+        or response.cfa is not None
+        or (one_point and (order or response.dark is not None))
+    ):
+        return float("nan")
+    scale = float(np.abs(response.levels).max())
+    design = np.vander(response.levels / scale, order + 1, increasing=True)
+    covariance = np.linalg.inv(design.T @ (design / np.reshape(noise, (-1, 1))))
+    at = (level / scale) ** np.arange(order + 1)
+    share = float(at @ covariance @ at / covariance[-1, -1]) * scale ** (2 * order)
+    good = usable(response.flags) & (response.used == len(response.levels))
+    slope = np.broadcast_to(slope_at(response.deviation, level), response.shape)
+    return float(np.mean(share * response.variances[-1][good] / slope[good] ** 2))
 
 
 def common_misfit(response: Response) -> float:

@@ -1,6 +1,7 @@
 """Main figures of results, with their names and units."""
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import asdict
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 from equipix._check import Array
 from equipix.bolometer.dynamic import DynamicCorrection
 from equipix.calibration.result import Calibration
+from equipix.comparison import Comparison
 from equipix.correction.protocol import Correction, sensor_of
 from equipix.diagnosis.coverage import FAR
 from equipix.findings import Findings, Flag, usable
@@ -22,7 +24,7 @@ _LEARNED = ("method", "data_range", "frames")
 """Keys of a scene's metadata that are shown."""
 
 
-def summary(content: Record | Correction | SceneCorrection) -> dict[str, Any]:
+def summary(content: Record | Correction | SceneCorrection | Comparison) -> dict[str, Any]:
     """Collect the main figures of what a file holds."""
     figures: Callable[[Any], dict[str, Any]] = _FIGURES.get(type(content), _of_correction)
     return figures(content)
@@ -164,8 +166,8 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
         **known(sensor=sensor_of(calibration)),
         "shape": list(calibration.shape),
         **_colours(calibration),
-        "mean": float(np.nanmean(sensitivity, dtype=np.float64)),
-        "spread": float(np.nanstd(sensitivity, dtype=np.float64)),
+        "sensitivity_mean": float(np.nanmean(sensitivity, dtype=np.float64)),
+        "sensitivity_spread": float(np.nanstd(sensitivity, dtype=np.float64)),
         **_uncertainty(calibration),
         "converged": calibration.converged,
         "error_estimate": calibration.error_estimate,
@@ -178,8 +180,62 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
         "flagged_pixels": flagged(calibration),
         **_rejected(calibration),
         "is_partial": calibration.is_partial,
+        "exposures": [*_exposures(calibration)],
         **told(calibration.findings),
     }
+
+
+def _exposures(calibration: Calibration) -> Iterator[dict[str, Any]]:
+    """Name, shift with its standard deviation where it is known, and flux of each exposure."""
+    shifts, std = calibration.shifts, calibration.shift_std
+    names = calibration.metadata.get("exposures", range(len(shifts)))
+    for number, name in enumerate(names):
+        yield {
+            "exposure": str(name),
+            "shift": shifts[number].tolist(),
+            "shift_std": None if std is None else std[number].tolist(),
+            "flux": float(calibration.flux[number]),
+        }
+
+
+def of_comparison(comparison: Comparison) -> dict[str, Any]:
+    """Collect the main figures of a comparison."""
+    pairs = comparison.pairs.tolist()
+    return {
+        "pixels_compared": int(np.isfinite(comparison.agreement).sum()),
+        "verdicts": {
+            f"{i} − {j}:": verdict
+            for (i, j), verdict in zip(pairs, comparison.verdicts, strict=True)
+        },
+    }
+
+
+COMPARED = ("relative difference", "found", "predicted", "ratio", "by noise")
+"""Titles of the rows that say how far two calibrations agree."""
+
+
+def rows_of(comparison: Comparison, pair: int) -> list[tuple[str, ...]]:
+    """Rows of a pair: what is judged, with the ratios that noise alone gives, then the rest."""
+    rows = {
+        each.what: (
+            each.found,
+            each.predicted,
+            f"{each.times:.3g}",
+            f"{each.low:.3g} to {each.high:.3g}",
+        )
+        for each in comparison.checks[pair]
+    }
+    for what, found, predicted in (
+        ("pixels, rms", comparison.rms, comparison.predicted_rms),
+        ("16×16 means, rms", comparison.block_rms, comparison.predicted_block_rms),
+        ("largest of a pixel", comparison.largest, None),
+    ):
+        known = math.nan if predicted is None else float(predicted[pair])
+        rows.setdefault(what, (float(found[pair]), known, "", ""))
+    return [
+        (what, f"{found:.2e}", f"{known:.2e}" if math.isfinite(known) else "not known", *limits)
+        for what, (found, known, *limits) in rows.items()
+    ]
 
 
 def _rejected(calibration: Calibration) -> dict[str, Any]:
@@ -221,6 +277,7 @@ _FIGURES: dict[type, Callable[[Any], dict[str, Any]]] = {
     FrameStatistics: of_statistics,
     Calibration: of_calibration,
     Response: of_response,
+    Comparison: of_comparison,
     DynamicCorrection: of_dynamic,
     **dict.fromkeys(METHODS.values(), of_scene),
 }
@@ -231,49 +288,104 @@ FIGURES = {
     "mean": ("mean", "DN"),
     "variance": ("variance of a frame", "DN²"),
     "saturation": ("saturation", "DN"),
+    "rejected_beyond_sigmas": ("rejected beyond", "standard deviations"),
     "levels": ("levels", "DN"),
     "spread_of_a": ("spread of the offset a", "DN"),
     "spread_of_K": ("spread of the gain deviation K", ""),
     "spread_of_c": ("spread of the curvature c", "1/DN"),
     "spread_of_e": ("spread of the cubic term e", "1/DN²"),
+    "prediction_errors": (
+        "prediction errors, in variances of a level (DN² where no noise is known)",
+        "",
+    ),
     "variance_of_a_value": ("variance of a value", "DN²"),
     "largest_inverse_error": ("largest error of the inverse", "DN"),
+    "scene_data_range": ("range of the scene", "DN"),
     "floor_dn": ("floor of the pattern", "DN"),
     "offset_rms": ("rms of the offset", "of the range"),
     "substrate_c": ("temperature of the substrate", "°C"),
     "bias_v": ("bias", "V"),
     "reduced_chi2": ("reduced χ²", ""),
+    "sensitivity_mean": ("mean of M", ""),
+    "sensitivity_spread": ("spread of M", ""),
     "sensitivity_std": ("standard deviation of M, median", ""),
+    "sensitivity_std_is_exact_to": ("relative error of that", ""),
     "tilt": ("tilt of M, edge to edge", ""),
     "tilt_std": ("standard deviation of the tilt", ""),
+    "error_estimate": ("error of M by the solver", ""),
+    "spatial_variance": ("spatial variance", "DN²"),
+    "temporal_variance": ("temporal variance", "DN²"),
+    "noise_variances": ("variances of noise", "DN²"),
+    "steps": ("steps, that of the gain a ratio", "DN"),
+    "largest_error_dn": ("largest error", "DN"),
+    "sag_dn": ("sag of the line", "DN"),
 }
 """Names and units of figures; of all others the name is the key, and there is no unit."""
 
+_WHOLE = 1e9
+"""Whole numbers below this are printed with all digits, as saturation levels are."""
 
-def words_of(figures: dict[str, Any]) -> list[tuple[str, str]]:
-    """Names and values of figures in words, findings left out."""
+_NOTHING = ("none", "not determined")
+
+
+def words_of(
+    figures: dict[str, Any], without: Collection[str] = ("findings", "exposures")
+) -> list[tuple[str, str]]:
+    """Names and values of figures in words, some left out."""
     return [
-        (FIGURES.get(key, (key.replace("_", " "), ""))[0], _words_of(key, value))
+        (FIGURES.get(key, (key.replace("_", " "), ""))[0], in_words(value, _unit(key)))
         for key, value in figures.items()
-        if key != "findings"
+        if key not in without
     ]
 
 
-def _words_of(key: str, value: Any) -> str:
-    unit = FIGURES.get(key, ("", ""))[1]
-    return f"{_plain(value)} {unit}".strip()
+def _unit(key: str) -> str:
+    return FIGURES.get(key, ("", ""))[1]
+
+
+def in_words(value: Any, unit: str = "") -> str:
+    """Write a value with its unit; what is no number is not determined."""
+    text = _plain(value)
+    return f"{text} {unit}" if unit and text not in _NOTHING else text
 
 
 def _plain(value: Any) -> str:
     match value:
         case bool():
             return "yes" if value else "no"
-        case None:
-            return "not known"
         case float():
-            return f"{value:.4g}"
+            return _number(value, ".0f" if value.is_integer() and abs(value) < _WHOLE else ".4g")
         case dict():
-            return ", ".join(f"{name} {_plain(item)}" for name, item in value.items()) or "none"
+            return (
+                ", ".join(f"{k} {in_words(each, _unit(k))}" for k, each in value.items()) or "none"
+            )
+        case [] | () | None:
+            return "none"
+        case [dict(), *_]:
+            return "\n".join(map(_row, value))
+        case [float(), *_]:
+            return ", ".join(_number(item, ".6g") for item in value)
+        case [str(), *_]:
+            return ", ".join(value)
         case list() | tuple():
-            return ", ".join(_plain(item) for item in value) or "none"
+            return " × ".join(str(item) for item in value)
     return str(value)
+
+
+def _number(value: float, form: str) -> str:
+    """Write a number; what is none is not determined."""
+    return f"{value:{form}}" if math.isfinite(value) else "not determined"
+
+
+def _row(fields: dict[str, Any]) -> str:
+    """Words of a row: of a finding its kind and its message, else numbers with their names."""
+    return f"{fields['kind']}: {fields['message']}" if "kind" in fields else _plain(fields)
+
+
+def pair_in_words(values: Any, std: Any) -> str:
+    """Row and column with their standard deviations, where they are known."""
+    errors = (None, None) if std is None else std
+    return ", ".join(
+        f"{value:.4f}" + (f" ± {error:.4f}" if error else "")
+        for value, error in zip(values, errors, strict=True)
+    )

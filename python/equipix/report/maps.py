@@ -9,9 +9,11 @@ import numpy as np
 from equipix._check import Array, Floats
 from equipix.bolometer.dynamic import DynamicCorrection
 from equipix.calibration.result import Calibration
+from equipix.comparison import Comparison
 from equipix.correction.protocol import Correction
 from equipix.findings import Flag
 from equipix.fitting.residuals import cell_side
+from equipix.measured.noise import BLOCK
 from equipix.measured.statistics import FrameStatistics
 from equipix.metrics.maps import block_means
 from equipix.nuc.response import Response
@@ -111,6 +113,18 @@ def _of_calibration(calibration: Calibration) -> Iterator[Map]:
         yield Map("Dark", "DN", calibration.dark)
 
 
+def _of_comparison(comparison: Comparison) -> Iterator[Map]:
+    yield Map("Scatter of the sensitivities", "", comparison.agreement, "size")
+    for number, (i, j) in enumerate(comparison.pairs):
+        yield from difference_maps(f"Difference {i} − {j}", comparison.difference(number))
+
+
+def difference_maps(name: str, difference: Floats) -> Iterator[Map]:
+    """Maps of the difference of two sensitivities, of pixels and of block means."""
+    yield Map(name, "", difference, "deviation")
+    yield Map(f"{name}, 16×16 means", "", block_means(difference), "deviation", BLOCK)
+
+
 def _of_response(response: Response) -> Iterator[Map]:
     names = ("Offset a", "Gain deviation K", "Curvature c", "Cubic term e")
     units = ("DN", "", "1/DN", "1/DN²")
@@ -151,6 +165,7 @@ def _of_correction(correction: Correction) -> Iterator[Map]:
 
 _MAPS: dict[type, Callable[[Any], Iterator[Map]]] = {
     Calibration: _of_calibration,
+    Comparison: _of_comparison,
     Response: _of_response,
     DynamicCorrection: _of_dynamic,
     FrameStatistics: _of_statistics,

@@ -8,6 +8,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -15,14 +16,24 @@ import numpy as np
 from equipix._check import Array, Floats
 from equipix._native import __version__
 from equipix.calibration.result import Calibration
+from equipix.comparison import Comparison
 from equipix.errors import EquipixError
 from equipix.findings import Finding, Flag, usable
+from equipix.io.paths import write_whole
 from equipix.nuc.response import Response
 from equipix.pictures import missing_matplotlib, new_figure
-from equipix.report.drawing import CMAPS, curves_of, draw_flags, limits_of
-from equipix.report.figures import summary, words_of
+from equipix.report.drawing import (
+    CMAPS,
+    curves_of,
+    draw_flags,
+    draw_histogram,
+    draw_profiles,
+    draw_spectrum,
+    limits_of,
+)
+from equipix.report.figures import COMPARED, pair_in_words, rows_of, summary, words_of
 from equipix.report.limits import Check, Limits, LimitsFile, checked
-from equipix.report.maps import Map, flagged, maps_of
+from equipix.report.maps import Map, difference_maps, flagged, maps_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -137,6 +148,45 @@ def part_of(name: str, result: Any, limits: LimitsFile, *, share: int = 1) -> Pa
     )
 
 
+def comparison_parts(
+    comparison: Comparison, names: Sequence[str], calibrations: Sequence[Calibration]
+) -> list[Part]:
+    """Collect what a page says of calibrations that were compared: a part for each pair."""
+    parts, largest = [], int(LARGEST / len(comparison.pairs) ** 0.5)
+    scatter = maps_of(comparison)[0]
+    for number, (i, j) in enumerate(comparison.pairs):
+        maps = [*difference_maps("Difference", comparison.difference(number)), scatter]
+        curves = (draw_histogram, draw_spectrum, draw_profiles)
+        parts.append(
+            Part(
+                name=f"{names[i]} − {names[j]}",
+                what=f"{comparison.verdicts[number]}.".capitalize(),
+                findings=tuple(dict.fromkeys(calibrations[i].findings + calibrations[j].findings)),
+                checks=[
+                    Check(
+                        f"{each.what}, found over predicted",
+                        f"{each.times:.3g}",
+                        f"{each.low:.3g} to {each.high:.3g}",
+                        each.low <= each.times <= each.high,
+                    )
+                    for each in comparison.checks[number]
+                ],
+                figures=words_of(summary(comparison), without=("verdicts",)),
+                maps=[mapped(each, largest) for each in maps],
+                plots=[drawn(partial(draw, shown=maps[0])) for draw in curves],
+                tables=[Table("Differences", COMPARED, rows_of(comparison, number))],
+                provenance=[(names[k], repr(calibrations[k]).strip("<>")) for k in (i, j)],
+            )
+        )
+    return parts
+
+
+def write_page(path: Path, text: str, *, force: bool) -> None:
+    """Write a page to a file; it appears whole or not at all."""
+    with write_whole(path, force=force) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
 def _limits_of(result: Any, limits: LimitsFile) -> Limits:
     """Limits of the kind of a result."""
     kinds: dict[type, Limits] = {Calibration: limits.calibration, Response: limits.response}
@@ -222,8 +272,8 @@ def _shifts(calibration: Calibration) -> Table:
     rows = [
         (
             str(names[k]),
-            _pair(measured[k], stated[k]),
-            _pair(calibration.shifts[k], None if std is None else std[k]),
+            "given" if measured[k] is None else pair_in_words(measured[k], stated[k]),
+            pair_in_words(calibration.shifts[k], None if std is None else std[k]),
             f"{calibration.rotation[k]}°",
             f"{calibration.flux[k]:.5g}",
         )
@@ -231,17 +281,6 @@ def _shifts(calibration: Calibration) -> Table:
     ]
     head = ("Exposure", "Measured (row, col)", "Used (row, col)", "Turned", "Flux")
     return Table("Exposures", head, rows, "Shifts in pixels, with standard deviations if known.")
-
-
-def _pair(values: Any, std: Any) -> str:
-    """Row and column with their standard deviations."""
-    if values is None:
-        return "given"
-    errors = (None, None) if std is None else std
-    return ", ".join(
-        f"{value:.4f}" + (f" ± {error:.4f}" if error else "")
-        for value, error in zip(values, errors, strict=True)
-    )
 
 
 def _errors(calibration: Calibration) -> Table:

@@ -16,6 +16,7 @@ from equipix.io.paths import find_files, refuse_inputs, write_whole
 from equipix.io.tiff import write_frames
 from equipix.metrics.maps import roughness
 from equipix.scene.scene_correction import SceneCorrection
+from equipix.shown import Brief
 
 _POINTS = 50
 """Most frames of which the quality is found."""
@@ -25,7 +26,7 @@ _MARK = "corrected by equipix from the scene"
 
 
 @dataclass(frozen=True)
-class SequenceResult:
+class SequenceResult(Brief):
     """What a sequence went through.
 
     Attributes

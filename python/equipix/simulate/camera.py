@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from equipix._check import Array, Floats, Rng, as_array, check_bit_depth, check_shape, positive
 from equipix.errors import InputError
+from equipix.shown import Brief
 
 Pixels: TypeAlias = "NDArray[np.int64]"
 
@@ -30,7 +31,7 @@ def _no_pixels() -> Pixels:
     return np.empty(0, np.int64)
 
 
-class Digitised:
+class Digitised(Brief):
     """What all virtual cameras share: the ADC, and the loop that makes frames."""
 
     bit_depth: int

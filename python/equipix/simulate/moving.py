@@ -9,6 +9,7 @@ import numpy as np
 
 from equipix._check import ArrayLike, Floats, check_shape
 from equipix.errors import InputError
+from equipix.shown import Brief
 
 _FIELD = 1024
 """Rows and columns of the field, which is periodic."""
@@ -45,7 +46,7 @@ class Frame(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class MovingScene:
+class MovingScene(Brief):
     """A textured scene that moves over an array of pixels with different gains and offsets.
 
     Frames are y = G x + O + noise of the scene x = b + contrast · S(p + c). S is a periodic random

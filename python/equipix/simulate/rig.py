@@ -14,6 +14,7 @@ from equipix.io.paths import as_path, folder_beside, replace_folder
 from equipix.io.tiff import write_frames
 from equipix.measured.colour import Colours
 from equipix.measured.noise import UNIFORM, scatter, unaveraged
+from equipix.shown import Brief
 from equipix.simulate.accuracy import noise_prediction
 from equipix.simulate.beams import Beam, check_beam, filtered, window
 from equipix.simulate.camera import Camera, Pixels
@@ -34,7 +35,7 @@ _FRAMES, _DARK, _BEFORE, _AFTER = range(4)
 
 
 @dataclass(frozen=True, eq=False)
-class Truth:
+class Truth(Brief):
     """What an experiment should find.
 
     Attributes
@@ -60,7 +61,7 @@ class Truth:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class VirtualExperiment:
+class VirtualExperiment(Brief):
     """An experiment whose frames are made on demand; see `experiment`.
 
     Every stream of frames has random numbers of its own and can be drawn again.
