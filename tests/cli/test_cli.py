@@ -493,7 +493,7 @@ def test_files_that_cannot_be_read_say_what_to_do(run, experiment, calibration, 
     assert run("hardware", calibration, "-o", table)[0] == 0
     for name, content, words in (
         ("cut.tif", frames.read_bytes()[:9999], "is truncated: copy it again"),
-        ("cal.tif", calibration.read_bytes()[:9999], "damaged, or no .tif file: use a copy"),
+        ("cal.tif", calibration.read_bytes()[:9999], "is damaged: array 'sensitivity' is missing"),
         ("no.npz", b"hello", "damaged, or no .npz file: use a copy"),
         ("word.tif", b"hello", "use a"),
         ("latin.toml", "format = 1\n# caf\xe9".encode("latin-1"), "line 2 is no UTF-8: save it"),

@@ -64,7 +64,7 @@ class TestExperiment:
         assert run("init", "experiment", folders)[0] == 0
         path = filled(folders / "experiment.toml", bit_depth=16, shift="[0, 5]")
         found = Experiment.load(path).manifest
-        assert found.dark.frames == "dark/*.tif"
+        assert found.dark[0].frames == "dark/*.tif"
         assert [(each.name, each.frames) for each in found.exposure] == [
             ("20C", "20C/*.tif"),
             ("40C", "40C/*.tif"),
@@ -107,7 +107,7 @@ class TestLevels:
                 write(tmp_path / f"{name}{k}.tif", 100 + k)
         assert run("init", "levels", tmp_path)[0] == 0
         found = LevelExperiment.load(filled(tmp_path / "levels.toml", bit_depth=16)).manifest
-        assert found.dark.frames == "p-dark-*.tif"
+        assert found.dark[0].frames == "p-dark-*.tif"
         assert {each.name: each.frames for each in found.level} == {
             # A glob p*.tif would find the others too.
             "p": ["p0.tif", "p1.tif", "p2.tif"],
@@ -206,5 +206,5 @@ def test_a_folder_that_does_not_exist_is_wrong_usage(run, tmp_path):
 def test_an_empty_folder_gives_an_example(run, tmp_path):
     assert run("init", "experiment", tmp_path)[0] == 0
     found = tomllib.loads((tmp_path / "experiment.toml").read_text())
-    assert found["dark"]["frames"] == "dark/*.tif"
+    assert found["dark"][0]["frames"] == "dark/*.tif"
     assert [each["frames"] for each in found["exposure"]] == ["p0/*.tif", "p1/*.tif"]

@@ -167,7 +167,7 @@ def test_averages_with_a_mask_calibrate(mask):
         ('mask = "none.png"', r"none\.png: does not exist"),
         ('mask = "wrong.npy"', r"wrong\.npy: is a mask of shape \(3, 4\), expected \(48, 64\)"),
         ('mask = "cube.npy"', r"cube\.npy: holds float64 of shape \(2, 48, 64\), expected one"),
-        ("mask = 3", r"'mask' in \[sensor\] holds 3, expected an image file"),
+        ("mask = 3", r"'mask' in \[sensor\] holds 3, expected an image \(TIFF"),
         ("region = 3", r"'region' in \[sensor\] holds 3, expected tables"),
         ("[[sensor.region]]\nrows = [5]", r"'rows' in \[\[sensor.region\]\] 1 holds \[5\]"),
         ("[[sensor.region]]\nrows = [5, 5]", r"\[5, 5\] holds no pixel.* in \[\[sensor.region\]\]"),

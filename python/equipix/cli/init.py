@@ -177,14 +177,14 @@ def _of_experiment(groups: list[_Group]) -> dict[str, Any]:
             position = {"shift": BLANK}
         given = {"name": group.name, "frames": group.entry}
         exposures.append(given | (position if exposures else {}))
-    return {"dark": {"frames": _flat(_dark(groups))}, "exposure": exposures}
+    return {"dark": [{"frames": _flat(_dark(groups))}], "exposure": exposures}
 
 
 def _of_levels(groups: list[_Group]) -> dict[str, Any]:
     """Give levels by their names, and the dark where there is one."""
     levels = [{"frames": each.entry, "name": each.name} for each in _light(groups)]
     dark = _dark(groups)
-    return {"level": levels} | ({"dark": {"frames": _flat(dark)}} if dark else {})
+    return {"level": levels} | ({"dark": [{"frames": _flat(dark)}]} if dark else {})
 
 
 def _of_camera(groups: list[_Group]) -> dict[str, Any]:
