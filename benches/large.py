@@ -132,4 +132,6 @@ def wait_after_interrupt(frames: np.ndarray, seconds: float) -> float:
 
 
 if __name__ == "__main__":
+    # A run that a script starts in the background ignores Ctrl-C, and would wait for it.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     print(json.dumps(measure((int(sys.argv[1]), int(sys.argv[2])))))

@@ -293,7 +293,9 @@ class TestEveryMethod:
     ):
         method = made(name)
         method.save(tmp_path / "state.npz")
-        with pytest.raises(errors.FileError, match=r"expected a correction: its correction\(\)"):
+        with pytest.raises(
+            errors.FileError, match=r"expected a correction: save its correction\(\)"
+        ):
             load_correction(tmp_path / "state.npz")
         rewrite(tmp_path / "state.npz", version=SceneState.VERSION + 1)
         with pytest.raises(errors.FileError, match=r"state.npz: holds state .* of version 6"):
