@@ -25,7 +25,6 @@ from astropy.nddata import CCDData, StdDevUncertainty
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
-from nexusformat.nexus import nxload
 from PIL import Image
 
 import equipix
@@ -40,6 +39,9 @@ from equipix.saved_results import RECORDS
 from equipix.scene.methods import METHODS
 from equipix.scene.scene_correction import SceneState
 from records import rewrite
+
+with np.printoptions():  # nexusformat sets those of the whole process
+    from nexusformat.nexus import nxload
 
 SHAPE = (24, 32)
 SUFFIXES = (".tif", ".npz", ".fits", ".nxs", ".asdf")

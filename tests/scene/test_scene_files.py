@@ -100,7 +100,7 @@ def test_files_and_findings_are_kept(run, recorded, tmp_path):
 def test_a_floor_that_is_not_known_is_said_in_words(run, recorded, tmp_path):
     command = ("scene", recorded[0] / "frame00*.tif", "-o", tmp_path / "nuc.npz", *RANGE)
     options = ("--method", "local-mean", "--force")
-    assert re.search(r"\nfloor dn +not determined\n", run(*command, *options)[1])
+    assert re.search(r"\nfloor of the pattern +not determined\n", run(*command, *options)[1])
     assert json.loads(run(*command, *options, "--json")[1])["floor_dn"] is None
 
 
