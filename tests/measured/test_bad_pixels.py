@@ -482,7 +482,8 @@ class TestLimits:
         assert loose.counts["dead"] == 1
 
     def test_wrong_limits_are_refused(self):
-        with pytest.raises(errors.InputError, match=r"'noise' .* is 0, expected more than 0"):
+        words = r"^'noise' \(--noise-limit\) is 0, expected more than 0$"
+        with pytest.raises(errors.InputError, match=words):
             nuc.DefectLimits(noise=0)
 
     def test_wrong_frames_are_refused(self, response):
