@@ -541,3 +541,27 @@ class TestRealCamera:
         np.testing.assert_allclose(found.prnu, wanted, rtol=0.01)
         plain = metrics.emva_spatial(many["b"], many["d"], highpass=False)
         assert plain.prnu.total == pytest.approx(0.004327, rel=0.01)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_tilt_is_a_least_squares_fit_over_the_valid_pixels(seed):
+    rng = np.random.default_rng(seed)
+    rows, cols = rng.integers(3, 40, 2)
+    sensitivity = np.exp(0.1 * rng.standard_normal((rows, cols)))
+    valid = rng.random((rows, cols)) < 0.7
+    row, col = np.nonzero(valid)
+    design = np.stack([np.ones(row.size), row / rows, col / cols], axis=1)
+    expected = np.linalg.lstsq(design, np.log(sensitivity[valid]), rcond=None)[0][1:]
+    sensitivity[~valid] = np.nan
+    found = equipix.metrics.maps.tilt(sensitivity, valid)
+    # Rounding: some eps of each value, times the condition of the fit.
+    bound = 1e-15 * row.size * np.linalg.cond(design) ** 2
+    np.testing.assert_allclose(found, expected, rtol=0, atol=bound)
+    weights = equipix.metrics.maps.tilt_weights(valid)
+    sums = np.sum(weights * np.where(valid, np.log(sensitivity), 0), axis=(1, 2))
+    np.testing.assert_allclose(found, sums, rtol=0, atol=bound)
+
+
+def test_pixels_on_a_line_have_no_tilt():
+    valid = np.eye(5, dtype=bool)
+    assert np.isnan(equipix.metrics.maps.tilt(np.ones((5, 5)), valid)).all()

@@ -157,7 +157,17 @@ def tilt(sensitivity: Array, valid: Bools) -> Floats:
         How much ln M grows from one edge of the sensor to the other.
     """
     logarithm = np.log(sensitivity, where=valid, out=np.zeros(valid.shape))
-    return np.asarray(np.einsum("arc,rc->a", tilt_weights(valid), logarithm))
+    along_rows, along_cols = logarithm.sum(axis=1), logarithm.sum(axis=0)
+    del logarithm
+    rows, cols = (np.arange(size) / size for size in valid.shape)
+    of_rows, of_cols = valid.sum(axis=1), valid.sum(axis=0)
+    count = max(int(of_rows.sum()), 1)
+    rows, cols = rows - of_rows @ rows / count, cols - of_cols @ cols / count
+    mixed = np.einsum("r,rc,c->", rows, valid, cols)
+    normal = np.array([[of_rows @ rows**2, mixed], [mixed, of_cols @ cols**2]])
+    if np.linalg.matrix_rank(normal, tol=1e-12 * count) < 2:
+        return np.full(2, np.nan)
+    return np.linalg.solve(normal, [along_rows @ rows, along_cols @ cols])
 
 
 @naming_memory("NETD")

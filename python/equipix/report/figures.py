@@ -151,11 +151,9 @@ def of_statistics(frames: FrameStatistics) -> dict[str, Any]:
 
 def flagged(correction: Correction | DynamicCorrection) -> dict[str, int]:
     """Count the pixels that have each flag."""
-    return {
-        flag.name or "": int(np.count_nonzero(correction.flags & flag))
-        for flag in Flag
-        if (correction.flags & flag).any()
-    }
+    bits = correction.flags[correction.flags != 0]
+    counts = {flag.name or "": int(np.count_nonzero(bits & flag)) for flag in Flag}
+    return {name: count for name, count in counts.items() if count}
 
 
 def of_calibration(calibration: Calibration) -> dict[str, Any]:

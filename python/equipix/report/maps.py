@@ -176,5 +176,7 @@ _MAPS: dict[type, Callable[[Any], Iterator[Map]]] = {
 
 def flagged(flags: Array) -> dict[Flag, tuple[Array, Array]]:
     """Rows and columns of the pixels that have each flag; ``DO_NOT_USE`` stands beside others."""
-    found = {flag: np.nonzero(flags & flag) for flag in Flag if flag != Flag.DO_NOT_USE}
-    return {flag: (rows, cols) for flag, (rows, cols) in found.items() if len(rows)}
+    pixels = np.flatnonzero(flags)
+    bits = flags.ravel()[pixels]
+    found = {flag: pixels[bits & flag != 0] for flag in Flag if flag != Flag.DO_NOT_USE}
+    return {flag: np.divmod(each, flags.shape[1]) for flag, each in found.items() if each.size}
