@@ -23,7 +23,7 @@ CMAPS = {"level": "gray", "deviation": "RdBu_r", "size": "viridis"}
 _SHARES = (0.1, 99.9)
 """Percentiles of a map that its colours span."""
 
-_MOST_BINS = 256
+_MOST_BINS = 1024
 
 _ENOUGH = 2**24
 """Pixels of a map whose lines tell medians, quartiles and spectra of all."""
@@ -145,15 +145,17 @@ def draw_histogram(axes: Axes, shown: Map) -> None:
     low, high = shown.extremes
     if high <= low:
         low, high = low - 0.5, high + 0.5
-    # Rice's rule: the bins of few pixels are wide.
-    count = int(np.isfinite(shown.values).sum())
-    bins = min(_MOST_BINS, round(2 * np.cbrt(count)))
-    counts, edges = np.histogram(shown.values, bins, (low, high))
-    axes.stairs(counts, edges, fill=True, alpha=0.6)
     middle, quarter, three = np.nanpercentile(_some(shown.values, 0), (50, 25, 75))
     spread = (three - quarter) / 1.349
+    # Rice's rule: the bins of few pixels are wide. Single pixels far out do not widen them.
+    count = int(np.isfinite(shown.values).sum())
+    bins = round(2 * np.cbrt(count))
     if spread > 0:
-        at = np.linspace(low, high, 4 * _MOST_BINS)
+        bins = max(bins, round(min(3 * (high - low) / spread, _MOST_BINS)))
+    counts, edges = np.histogram(shown.values, min(bins, _MOST_BINS), (low, high))
+    axes.stairs(counts, edges, fill=True, alpha=0.6)
+    if spread > 0:
+        at = np.linspace(low, high, _MOST_BINS)
         normal = np.exp(-0.5 * ((at - middle) / spread) ** 2) / (spread * np.sqrt(2 * np.pi))
         axes.plot(at, normal * count * (edges[1] - edges[0]), color="black", linewidth=0.8)
     axes.set(
@@ -201,7 +203,7 @@ def draw_spectrum(axes: Axes, shown: Map) -> None:
     root of the number of pixels along them, as in the spectrograms of EMVA 1288, release 4.0,
     section 8.2. Pixels without a value count as the mean.
     """
-    positive = False
+    drawn = []
     for axis, name in ((1, "along rows"), (0, "along columns")):
         values = _some(shown.values, 1 - axis).astype(np.float64)
         values = np.nan_to_num(values - np.nanmean(values))
@@ -209,13 +211,18 @@ def draw_spectrum(axes: Axes, shown: Map) -> None:
         size = values.shape[axis]
         line = np.sqrt(power.mean(axis=1 - axis) / size)
         axes.plot(np.fft.rfftfreq(size)[1:], line[1:], linewidth=0.8, label=name)
-        positive |= bool((line[1:] > 0).any())
+        drawn.append(line[1:])
     axes.set(
         title=f"Spectrum of {shown.name[0].lower()}{shown.name[1:]}",
         xlabel="cycles per pixel",
         ylabel=shown.unit or "relative",
-        yscale="log" if positive else "linear",
     )
+    positive = np.concatenate(drawn)
+    positive = positive[positive > 0]
+    if positive.size:
+        # Whole decades: ticks at less would be crowded, and a flat spectrum looks flat.
+        decades = np.log10([0.9 * positive.min(), 1.1 * positive.max()])
+        axes.set(yscale="log", ylim=10.0 ** np.array([np.floor(decades[0]), np.ceil(decades[1])]))
     axes.legend(fontsize="small")
 
 

@@ -300,7 +300,7 @@ FIGURES = {
     "largest_inverse_error": ("largest error of the inverse", "DN"),
     "scene_data_range": ("range of the scene", "DN"),
     "floor_dn": ("floor of the pattern", "DN"),
-    "offset_rms": ("rms of the offset", "of the range"),
+    "offset_rms": ("rms of the offset", "DN"),
     "substrate_c": ("temperature of the substrate", "°C"),
     "bias_v": ("bias", "V"),
     "reduced_chi2": ("reduced χ²", ""),
