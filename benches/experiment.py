@@ -53,7 +53,8 @@ def averaged(experiment: equipix.Experiment) -> list[equipix.FrameStatistics]:
     """Averages of the dark, subtracted, and of all exposures."""
     path, manifest = experiment.path, experiment.manifest
     level = manifest.sensor.saturation_level
-    dark = equipix.average(find_files(path, manifest.dark.frames), saturation=level)
+    darks = [file for each in manifest.dark or () for file in find_files(path, each.frames)]
+    dark = equipix.average(darks, saturation=level)
     return [
         equipix.average(find_files(path, each.frames), dark=dark, saturation=level)
         for each in manifest.exposure
