@@ -327,14 +327,19 @@ class Level(Taken):
         return self
 
 
-class LevelManifest(Table):
-    """The whole levels.toml."""
+class WholeFile(Table):
+    """What each file that describes measurements begins with."""
 
     format: Literal[1] = _format()
     sensor: Sensor = key("a table", default=Sensor())
     layout: Layout | None = key(
         "a table", "how the bytes of files without a format of their own are frames"
     )
+
+
+class LevelManifest(WholeFile):
+    """The whole levels.toml."""
+
     dark: Darks | None = key(
         DARKS,
         "frames without light; without it the level without light is part of the curves",
@@ -365,14 +370,9 @@ class LevelManifest(Table):
         return list(zip(self.names, self.level, strict=True))
 
 
-class Manifest(Table):
+class Manifest(WholeFile):
     """The whole experiment.toml."""
 
-    format: Literal[1] = _format()
-    sensor: Sensor = key("a table", default=Sensor())
-    layout: Layout | None = key(
-        "a table", "how the bytes of files without a format of their own are frames"
-    )
     dark: Darks | None = key(
         DARKS,
         "one or several, of which each exposure takes the one that fits; only raw files of cameras "
@@ -453,17 +453,12 @@ class CameraLight(Table):
     )
 
 
-class CameraManifest(Table):
+class CameraManifest(WholeFile):
     """The whole camera.toml."""
 
     unused: ClassVar = ("saturation", "gain_dn_per_e", "mask", "region")
     """Keys of ``[sensor]`` that it does not have."""
 
-    format: Literal[1] = _format()
-    sensor: Sensor = key("a table", default=Sensor())
-    layout: Layout | None = key(
-        "a table", "how the bytes of files without a format of their own are frames"
-    )
     light: CameraLight | None = key("a table", "what turns an irradiance into photons")
     exposure: Annotated[list[CameraExposure], Field(min_length=2)] = needed(
         "two or more tables [[exposure]]"
