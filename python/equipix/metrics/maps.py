@@ -131,14 +131,26 @@ def tilt_weights(valid: Bools) -> Floats:
         For the slopes along rows and columns, each times the size of the sensor along it. NaN
         where the valid pixels determine no slope.
     """
-    count = max(int(np.count_nonzero(valid)), 1)
-    coordinates = np.indices(valid.shape) / np.reshape(valid.shape, (2, 1, 1))
-    means = np.sum(coordinates, axis=(1, 2), where=valid) / count
-    centred = np.where(valid, coordinates - means[:, None, None], 0)
-    normal = np.einsum("arc,brc->ab", centred, centred)
-    if np.linalg.matrix_rank(normal, tol=1e-12 * count) < 2:
+    plane = _plane(valid)
+    if plane is None:
         return np.full((2, *valid.shape), np.nan)
+    rows, cols, normal = plane
+    centred = [np.where(valid, each, 0) for each in (rows[:, None], cols)]
     return np.asarray(np.einsum("ab,brc->arc", np.linalg.inv(normal), centred))
+
+
+def _plane(valid: Bools) -> tuple[Floats, Floats, Floats] | None:
+    """Places of rows and columns from their mean over valid pixels, and the sums of their products.
+
+    They are over the size of the sensor along each axis. None where valid pixels are in one line.
+    """
+    rows, cols = (np.arange(size) / size for size in valid.shape)
+    of_rows, of_cols = valid.sum(axis=1), valid.sum(axis=0)
+    count = max(int(of_rows.sum()), 1)
+    rows, cols = rows - of_rows @ rows / count, cols - of_cols @ cols / count
+    mixed = np.einsum("r,rc,c->", rows, valid, cols)
+    normal = np.array([[of_rows @ rows**2, mixed], [mixed, of_cols @ cols**2]])
+    return (rows, cols, normal) if np.linalg.matrix_rank(normal, tol=1e-12 * count) == 2 else None
 
 
 def tilt(sensitivity: Array, valid: Bools) -> Floats:
@@ -156,18 +168,13 @@ def tilt(sensitivity: Array, valid: Bools) -> Floats:
     ndarray, shape (2,), float64
         How much ln M grows from one edge of the sensor to the other.
     """
-    logarithm = np.log(sensitivity, where=valid, out=np.zeros(valid.shape))
-    along_rows, along_cols = logarithm.sum(axis=1), logarithm.sum(axis=0)
-    del logarithm
-    rows, cols = (np.arange(size) / size for size in valid.shape)
-    of_rows, of_cols = valid.sum(axis=1), valid.sum(axis=0)
-    count = max(int(of_rows.sum()), 1)
-    rows, cols = rows - of_rows @ rows / count, cols - of_cols @ cols / count
-    mixed = np.einsum("r,rc,c->", rows, valid, cols)
-    normal = np.array([[of_rows @ rows**2, mixed], [mixed, of_cols @ cols**2]])
-    if np.linalg.matrix_rank(normal, tol=1e-12 * count) < 2:
+    plane = _plane(valid)
+    if plane is None:
         return np.full(2, np.nan)
-    return np.linalg.solve(normal, [along_rows @ rows, along_cols @ cols])
+    rows, cols, normal = plane
+    logarithm = np.log(sensitivity, where=valid, out=np.zeros(valid.shape))
+    pulls = [logarithm.sum(axis=1) @ rows, logarithm.sum(axis=0) @ cols]
+    return np.linalg.solve(normal, pulls)
 
 
 @naming_memory("NETD")
