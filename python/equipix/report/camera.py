@@ -95,20 +95,22 @@ def _words_of(found: CameraFigures) -> list[tuple[str, str]]:
 def camera_parts(name: str, planes: dict[str, CameraFigures]) -> list[Part]:
     """Collect what a page says of a camera: a part for each plane of its colour filters."""
     largest, last = int(LARGEST / len(planes) ** 0.5), [*planes][-1]
-    return [
-        Part(
+    parts = []
+    for plane, found in planes.items():
+        maps = _maps(found)
+        part = Part(
             name=f"{name}, plane {plane}" if plane else name,
             what=f"EMVA 1288 release 4.0 linear, {len(found.photons)} levels",
             findings=found.findings,
             checks=[],
             figures=_words_of(found),
-            maps=[mapped(each, largest) for each in _maps(found)],
-            plots=[*map(drawn, _curves(found))],
+            maps=[mapped(each, largest) for each in maps],
+            plots=[*map(drawn, _curves(found, maps))],
             tables=[_levels(found)],
             provenance=provenance_of(found.metadata) if plane == last else [],
         )
-        for plane, found in planes.items()
-    ]
+        parts.append(part)
+    return parts
 
 
 def _maps(found: CameraFigures) -> list[Map]:
@@ -143,14 +145,14 @@ def _ratio(found: CameraFigures) -> Floats:
     return np.where(below, _signal(found) / np.sqrt(np.where(below, found.on[:, 1], 1)), np.nan)
 
 
-def _curves(found: CameraFigures) -> Iterator[Callable[[Axes], None]]:
+def _curves(found: CameraFigures, maps: list[Map]) -> Iterator[Callable[[Axes], None]]:
     """Functions that draw the curves."""
     for draw in (_draw_responsivity, _draw_transfer, _draw_linearity, _draw_snr):
         yield partial(draw, found=found)
     if np.isfinite(found.transfer.dark_current_mean):
         for column in (0, 1):
             yield partial(_draw_dark, found=found, column=column)
-    for shown in _maps(found):
+    for shown in maps:
         yield partial(draw_spectrum, shown=shown)
         for axis in (0, 1):
             yield partial(_draw_profiles, shown=shown, axis=axis)

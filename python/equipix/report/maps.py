@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -56,7 +57,7 @@ class Map:
         """Name and unit."""
         return f"{self.name}, {self.unit}" if self.unit else self.name
 
-    @property
+    @cached_property
     def extremes(self) -> tuple[float, float]:
         """Smallest and largest value; NaN where there is none."""
         known = self.values[np.isfinite(self.values)]
