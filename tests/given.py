@@ -14,6 +14,8 @@ from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Positions
 from equipix.io.tiff import write_frames
 from equipix.measured.measured import measured_of
+from equipix.scene.methods import METHODS
+from equipix.scene.scene_correction import SceneCorrection
 
 SMALL = (9, 12)
 SMALL_CROSS = np.array([(0, 0), (0, 2), (0, 3), (2, 0), (3, 0)], float)
@@ -147,3 +149,11 @@ def write_dng(path, counts, *, pattern="RGGB", black=64, white=4095, exposure=(1
         extratags=[(*each, True) for each in tags],
     )
     return path
+
+
+def learned(name: str, shape: tuple[int, int]) -> SceneCorrection:
+    """A method of `equipix.scene` that has learned from forty frames of a moving scene."""
+    method = METHODS[name](shape, (0, 1))
+    for frame in simulate.MovingScene(seed=1, shape=shape).frames(40):
+        method.update(frame.values)
+    return method

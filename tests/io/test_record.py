@@ -38,6 +38,7 @@ from equipix.io.record import UNSAVED, Map, Record, read_record
 from equipix.saved_results import RECORDS
 from equipix.scene.methods import METHODS
 from equipix.scene.scene_correction import SceneState
+from given import learned
 from records import rewrite
 
 with np.printoptions():  # nexusformat sets those of the whole process
@@ -60,13 +61,6 @@ def calibration(**options):
     frames = simulate.exposures(truth, simulate.gaussian_beam(SHAPE, width=60), shifts)
     frames += 1e-3 * np.random.default_rng(2).standard_normal(frames.shape)
     return equipix.calibrate(frames, shifts, tolerance=1e-3, **options)
-
-
-def learned(name):
-    method = METHODS[name](SHAPE, (0, 1))
-    for frame in simulate.MovingScene(seed=1, shape=SHAPE).frames(40):
-        method.update(frame.values)
-    return method
 
 
 def made():
@@ -139,7 +133,7 @@ def test_every_kind_states_versions_and_the_time(name):
     others = {
         "lens": lambda: lens.fit(1000 / (1 + squared / 30.0**2) ** 2).correction(),
         "state": lambda: KINDS["dynamic"].correction(10.0),
-        "scene": lambda: learned("gated").correction(),
+        "scene": lambda: learned("gated", SHAPE).correction(),
     }
     found = others[name]().metadata if name in others else KINDS[name].metadata
     assert found["versions"] == {"equipix": equipix.__version__, "numpy": np.__version__}
@@ -311,7 +305,7 @@ def test_a_mean_of_frames_has_one_use():
     with pytest.raises(InputError, match="'use' is 'sum', expected 'flat', 'gain' or None"):
         KINDS["response"].to_xarray(use="sum")
     with pytest.raises(InputError, match=r"no map for other programs; its correction\(\) has one"):
-        learned("gated").to_ccddata()
+        learned("gated", SHAPE).to_ccddata()
 
 
 @pytest.mark.parametrize("library", ["xarray", "asdf"])
@@ -327,7 +321,7 @@ def test_a_missing_library_is_named(tmp_path, monkeypatch, library):
 
 @pytest.mark.parametrize("name", [*KINDS, "state"])
 def test_convert_loses_nothing_on_any_way(tmp_path, run, name):
-    (learned("gated") if name == "state" else KINDS[name]).save(tmp_path / "0.npz")
+    (learned("gated", SHAPE) if name == "state" else KINDS[name]).save(tmp_path / "0.npz")
     files = [tmp_path / f"{k}{suffix}" for k, suffix in enumerate([".npz", *SUFFIXES, ".npz"])]
     for one, other in pairwise(files):
         assert run("convert", one, other)[0] == 0
@@ -388,7 +382,7 @@ def test_all_records_are_tested():
 @pytest.mark.parametrize("suffix", SUFFIXES)
 @pytest.mark.parametrize("name", METHODS)
 def test_a_state_comes_back_bit_by_bit(tmp_path, name, suffix):
-    path, method = tmp_path / f"a{suffix}", learned(name)
+    path, method = tmp_path / f"a{suffix}", learned(name, SHAPE)
     method.save(path)
     loaded = equipix.load(path)
     assert type(loaded) is type(method)
@@ -410,7 +404,7 @@ def test_a_table_is_read_by_its_suffix(tmp_path):
 @pytest.mark.parametrize("name", [*KINDS, "state"])
 def test_a_changed_byte_of_any_array_is_noticed(tmp_path, name, suffix):
     path = tmp_path / f"a{suffix}"
-    (learned("gated") if name == "state" else KINDS[name]).save(path)
+    (learned("gated", SHAPE) if name == "state" else KINDS[name]).save(path)
     pages, content = load_pages(path)
     for key, page in pages.items():
         changed = bytearray(page.tobytes())
@@ -554,7 +548,7 @@ def test_a_reader_of_one_kind_refuses_the_others(tmp_path):
 
 def test_inspect_shows_every_kind(tmp_path, run):
     table = hardware.Table.of(KINDS["polynomial"], linearise=(500, 3000))
-    for name, each in (KINDS | {"state": learned("kalman")}).items():
+    for name, each in (KINDS | {"state": learned("kalman", SHAPE)}).items():
         each.save(tmp_path / f"{name}.npz")
         status, out, _ = run("inspect", tmp_path / f"{name}.npz", "--json")
         assert (status, json.loads(out)["shape"]) == (0, [*SHAPE]), name

@@ -9,7 +9,7 @@ import numpy as np
 import equipix
 from equipix import bolometer, hardware, nuc, simulate
 from equipix.findings import Finding
-from equipix.scene.methods import METHODS
+from given import learned
 
 SHAPE = (24, 32)
 
@@ -35,14 +35,6 @@ def calibration(**options):
     return dataclasses.replace(found, findings=(*found.findings, finding))
 
 
-def learned(name):
-    """A correction that has learned from a scene."""
-    method = METHODS[name](SHAPE, (0, 1))
-    for frame in simulate.MovingScene(seed=1, shape=SHAPE).frames(40):
-        method.update(frame.values)
-    return method
-
-
 def every_kind():
     """Results by what they are."""
     dark = equipix.average(measured(0), saturation=4095)
@@ -57,6 +49,6 @@ def every_kind():
         "averages": levels[0],
         "polynomial": equipix.combine(response, nuc.fit([each.mean for each in levels], order=1)),
         "dynamic": bolometer.fit(shutter, celsius, 2.0, order=1),
-        "scene": learned("constant-statistics"),
+        "scene": learned("constant-statistics", SHAPE),
         "table": hardware.Table.of(line, offset_bits=12, gain_bits=12),
     }

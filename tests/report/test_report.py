@@ -13,7 +13,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from report_results import calibration, every_kind, learned, measured
+from report_results import SHAPE, calibration, every_kind, measured
 
 import equipix
 from equipix import detector, hardware, lens, metrics, nuc, plan, simulate
@@ -22,7 +22,7 @@ from equipix.report.limits import LimitsFile, limits_template, read_limits
 from equipix.report.maps import Map, maps_of
 from equipix.report.page import page, part_of
 from equipix.scene.methods import METHODS
-from given import written_camera
+from given import learned, written_camera
 
 NOTHING = LimitsFile()
 
@@ -347,7 +347,7 @@ def test_short_forms_are_a_line(results, tmp_path):
     )
     shown = [
         *results.values(),
-        *(learned(name) for name in METHODS),
+        *(learned(name, SHAPE) for name in METHODS),
         *(cal.orientation, cal.drift, *cal.findings, equipix.compare([cal, cal])),
         *(equipix.Corrector(response), nuc.DefectLimits(), nuc.find_defects(response, raw)),
         *(metrics.correctability(raw), metrics.three_d_noise(raw)),
