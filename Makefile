@@ -6,6 +6,10 @@ SOURCES := $(shell find rust python -name '*.rs' -o -name '*.py') Cargo.toml Car
 # Share of the seeds or parameter sets of each study that `make test` runs.
 STUDIES ?= 0.1
 
+# Two processes of tests share two processors: threads of BLAS would wait for each other, and dense algebra take
+# five times as long.
+test study: export OPENBLAS_NUM_THREADS := 1
+
 .PHONY: demo test study bench figures docs lint audit build clean
 
 # Scripts: that every name and argument that they use is there.
