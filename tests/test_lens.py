@@ -257,7 +257,7 @@ class TestCombine:
         loaded = equipix.load(tmp_path / "both.npz")
         np.testing.assert_array_equal(loaded.flags, flags)
         np.testing.assert_array_equal(loaded.coefficients, both.coefficients)
-        assert "order 3" in repr(loaded)
+        assert "degree 3" in repr(loaded)
         assert equipix.Corrector(loaded).replaced == 1
 
     @pytest.mark.parametrize("order", [0, 1, 2])
@@ -335,7 +335,7 @@ class TestCombine:
 
     def test_what_does_not_combine_is_refused(self):
         response = nuc.fit(self.levels(), order=2)
-        with pytest.raises(errors.InputError, match="'then' has order 3"):
+        with pytest.raises(errors.InputError, match="'then' corrects by a polynomial of degree 3"):
             equipix.combine(response, response)
         line = response.coefficients[:2]
         one, other = (
