@@ -335,7 +335,7 @@ class TestCombine:
 
     def test_what_does_not_combine_is_refused(self):
         response = nuc.fit(self.levels(), order=2)
-        with pytest.raises(errors.InputError, match="'then' corrects by a polynomial of degree 3"):
+        with pytest.raises(errors.InputError, match="'then' has degree 3"):
             equipix.combine(response, response)
         line = response.coefficients[:2]
         one, other = (

@@ -119,8 +119,8 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     after = np.asarray(then.coefficients, np.float64)
     if len(after) > 2:
         raise InputError(
-            f"'then' corrects by a polynomial of degree {len(after) - 1} in the raw value, expected "
-            "offset and gain: combine in the other order, or correct frames twice"
+            f"'then' has degree {len(after) - 1} in the raw value, expected 1, offset and gain: "
+            "combine in the other order, or correct frames twice"
         )
     gain = after[1] if len(after) == 2 else 0.0
     _refuse_raw(then)
