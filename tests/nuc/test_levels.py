@@ -324,6 +324,21 @@ class TestDefectsAndQuality:
         assert told["percentiles_of_K"] == pytest.approx(wanted.gain_percentiles)
         np.testing.assert_array_equal(equipix.load(output).flags, response.flags | wanted.flags)
 
+    def test_filters_are_a_key_of_the_file(self, run, tmp_path):
+        """Of the three commands `defects` and `quality` alone have an option for them."""
+        colour, text = np.tile([[1.0, 2.0], [2.0, 3.0]], (16, 20)), ""
+        for light in (500, 1000, 1500):
+            frames = light * colour + np.random.default_rng(light).normal(0, 3, (4, *colour.shape))
+            write_frames(tmp_path / f"{light}.tif", np.rint(frames).astype(np.uint16), nbytes=1)
+            text += f'[[level]]\nframes = "{light}.tif"\n'
+        (tmp_path / "levels.toml").write_text("[sensor]\nbit_depth = 14\n" + text)
+        out = tmp_path / "r.npz"
+        err = run("nuc", "fit", tmp_path / "levels.toml", "-o", out)[2]
+        assert "no 'cfa' is given" in err
+        assert "(in [sensor] of a manifest)" in err
+        assert "--cfa" not in err
+        assert "write --cfa RGGB" in run("nuc", "defects", out)[2]
+
     def test_defects_of_curves_alone(self, run, saved):
         status, out, _ = run("nuc", "defects", saved[1])
         assert status == 0
