@@ -80,6 +80,20 @@ class TestCombine:
         wanted = equipix.combine(first, then)
         assert equipix.load(out).coefficients.tobytes() == wanted.coefficients.tobytes()
 
+    def test_says_what_limits_the_two(self, run, tmp_path):
+        """Such as a lens that was fitted to frames with their dark."""
+        flat = 1000 * np.ones((16, 20))
+        equipix.nuc.fit([flat, 2 * flat]).save(tmp_path / "curves.npz")
+        rows, cols = np.mgrid[:16, :20]
+        light = 3000 / (1 + ((rows - 8) ** 2 + (cols - 9) ** 2) / 400) ** 2
+        write(tmp_path / "flat.tif", light + 100)
+        assert run("lens", tmp_path / "flat.tif", "-o", tmp_path / "lens.npz")[0] == 0
+        given = (tmp_path / "curves.npz", tmp_path / "lens.npz", "-o", tmp_path / "both.npz")
+        status, printed, err = run("combine", *given)
+        assert status == 0
+        assert "equipix: warning: no dark was subtracted from frames of whole numbers" in err
+        assert re.search(r"findings +raw", printed)
+
     def test_refuses_what_python_refuses(self, run, tmp_path):
         for name, size in (("a", 4), ("b", 5)):
             flat = equipix.Polynomial(np.ones((2, size, 6)), np.zeros((size, 6), np.uint32))

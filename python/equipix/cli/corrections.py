@@ -44,6 +44,7 @@ def combine(
     terminal.check_output(output, [first, then], force=force, suffixes=SUFFIXES)
     both = combine_corrections(load_correction(first), load_correction(then))
     both = replace(both, metadata=with_inputs(both.metadata, sha256_of([first, then])))
+    say(*both.findings)
     terminal.show_saved(output, both, force=force, as_json=as_json)
 
 
