@@ -13,6 +13,7 @@ import pytest
 
 import equipix
 from equipix import Flag, bolometer, errors, metrics, simulate
+from equipix.bolometer.state_fit import references_of, response_of
 from equipix.report.maps import maps_of
 from equipix.saved_results import load_correction
 from equipix.simulate import BolometerArray
@@ -398,6 +399,19 @@ def test_auto_takes_no_order_that_states_without_one_do_not_determine():
     shutter = [array.mean(c, bias_v=v) for c, v in zip(celsius, volts, strict=True)]
     correction = bolometer.fit(shutter, celsius, volts)
     assert 1 <= correction.axes.order <= 3
+
+
+def test_the_noise_of_a_response_is_that_of_both_black_bodies():
+    rng, good = np.random.default_rng(1), np.ones((16, 20), bool)
+    bodies = [
+        references_of(name, [equipix.average(level + sigma * rng.standard_normal((8, 16, 20)))] * 2)
+        for name, level, sigma in (("cold", 1000.0, 3.0), ("hot", 1400.0, 6.0))
+    ]
+    response, variance = response_of(bodies, good)
+    wanted = (3**2 + 6**2) / 8 / 400**2
+    # Of 320 sample variances of 7 degrees of freedom.
+    np.testing.assert_allclose(variance, wanted, rtol=5 * np.sqrt(2 / 320 / 7))
+    assert response.var() == pytest.approx(wanted, rel=5 * np.sqrt(2 / 640) * np.sqrt(2))
 
 
 class TestBodiesOfOtherStates:
