@@ -535,7 +535,7 @@ def test_corrections_without_use_are_refused():
 
 def test_a_curved_correction_needs_a_line():
     correction = polynomial(10.0, 1.0, 1e-5)
-    with pytest.raises(errors.InputError, match="of order 2, .* order 1, or give 'linearise'"):
+    with pytest.raises(errors.InputError, match="degree 2 in raw.* order 1, or give 'linearise'"):
         hardware.Table.of(correction)
     table = hardware.Table.of(correction, linearise=(1000.0, 3000.0), out_step=2.0**-3, adc_bits=12)
     # A parabola is c (h/2)² below its chord: 10 DN; half of it is left on either side.

@@ -57,7 +57,8 @@ class _Commands(TyperGroup):
         name, found, rest = super().resolve_command(ctx, args)
         if name is not None:
             found = command(name)
-            CALLED.set(found)
+            # Of a group the command, whose options are not those of the others.
+            CALLED.set(getattr(found, "commands", {}).get(next(iter(rest), ""), found))
         return name, found, rest
 
 

@@ -258,13 +258,14 @@ def line_of(
     """
     planes = np.asarray(correction.coefficients, np.float64)
     if len(planes) < 2:
-        raise InputError("'correction' has no gain, expected coefficients of order 1 or more")
+        raise InputError("'correction' has no gain, expected a polynomial of degree 1 or more")
     if linearise is None:
         if len(planes) > 2 and np.nan_to_num(planes[2:]).any():
             raise InputError(
-                f"'correction' is of order {len(planes) - 1}, but a table of gain and offset holds "
-                "order 1: fit a response of order 1, or give 'linearise' (--linearise), two raw "
-                "values in DN between which a straight line takes the place of the curve"
+                f"'correction' has degree {len(planes) - 1} in raw values, but a table of gain and "
+                "offset holds degree 1: fit a response of order 1, or give 'linearise' "
+                "(--linearise), two raw values in DN between which a straight line takes the place "
+                "of the curve"
             )
         return (planes[0], planes[1]), 0.0
     return _chord(planes, usable(correction.flags), *check_range(linearise))

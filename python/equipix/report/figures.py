@@ -23,6 +23,9 @@ from equipix.scene.scene_correction import SceneCorrection
 _LEARNED = ("method", "data_range", "frames")
 """Keys of a scene's metadata that are shown."""
 
+_LAW = ("law", "centre", "focal_length", "k1", "k2", "std", "least_illumination")
+"""Keys of a lens's metadata that are shown."""
+
 
 def summary(content: Record | Correction | SceneCorrection | Comparison) -> dict[str, Any]:
     """Collect the main figures of what a file holds."""
@@ -47,7 +50,8 @@ def _of_correction(correction: Correction) -> dict[str, Any]:
     return {
         **known(sensor=sensor_of(correction)),
         "shape": list(correction.shape),
-        "order": len(correction.coefficients) - 1,
+        "degree": len(correction.coefficients) - 1,
+        **{name: correction.metadata[name] for name in _LAW if name in correction.metadata},
         **{f"scene_{name}": learned[name] for name in _LEARNED if name in learned},
         "flagged_pixels": flagged(correction),
         **told(correction.findings),
@@ -112,10 +116,24 @@ def of_dynamic(correction: DynamicCorrection) -> dict[str, Any]:
         "bias_v": list(correction.axes.bias_v),
         "order": correction.axes.order,
         "bias_order": correction.axes.bias_order,
-        "gain_order": None if correction.gain is None else correction.gain_axes.order,
+        **_errors("offset_prediction_errors", correction.metadata.get("prediction_errors")),
+        **_gain(correction),
         "flagged_pixels": flagged(correction),
         **told(correction.findings),
     }
+
+
+def _gain(correction: DynamicCorrection) -> dict[str, Any]:
+    """Order of the gain and its errors, or what is not found without black bodies."""
+    if correction.gain is None:
+        return {"gain_order": None, "dead_pixels": "not determinable without black bodies"}
+    errors = correction.metadata.get("gain_prediction_errors")
+    return {"gain_order": correction.gain_axes.order, **_errors("gain_prediction_errors", errors)}
+
+
+def _errors(name: str, squares: list[float] | None) -> dict[str, list[float]]:
+    """Rms errors of the predictions of held-out temperatures, from order 0 on."""
+    return {} if squares is None else {name: np.sqrt(squares).tolist()}
 
 
 def of_scene(method: SceneCorrection) -> dict[str, Any]:
@@ -296,8 +314,11 @@ FIGURES = {
         "prediction errors, in variances of a level (DN² where no noise is known)",
         "",
     ),
+    "offset_prediction_errors": ("rms errors of predicted offsets, order 0 and up", "DN"),
+    "gain_prediction_errors": ("rms errors of predicted gains, order 0 and up, relative", ""),
     "variance_of_a_value": ("variance of a value", "DN²"),
     "largest_inverse_error": ("largest error of the inverse", "DN"),
+    "degree": ("degree of the correction in raw values", ""),
     "scene_data_range": ("range of the scene", "DN"),
     "floor_dn": ("floor of the pattern", "DN"),
     "offset_rms": ("rms of the offset", "DN"),
@@ -311,6 +332,21 @@ FIGURES = {
     "tilt": ("tilt of M, edge to edge", ""),
     "tilt_std": ("standard deviation of the tilt", ""),
     "error_estimate": ("error of M by the solver", ""),
+    "centre": ("centre (row, col)", "pixels"),
+    "row": ("row", "pixels"),
+    "col": ("col", "pixels"),
+    "focal_length": ("focal length", "pixels"),
+    "k1": ("k1 of (r over half the diagonal)²", ""),
+    "k2": ("k2 of (r over half the diagonal)⁴", ""),
+    "std": ("standard errors", ""),
+    "least_illumination": ("least illumination, relative to the centre", ""),
+    "t": ("time t", ""),
+    "v": ("rows v", ""),
+    "h": ("columns h", ""),
+    "tv": ("rows and time tv", ""),
+    "th": ("columns and time th", ""),
+    "vh": ("pixels vh", ""),
+    "tvh": ("pixels and time tvh", ""),
     "spatial_variance": ("spatial variance", "DN²"),
     "temporal_variance": ("temporal variance", "DN²"),
     "noise_variances": ("variances of noise", "DN²"),
@@ -355,7 +391,11 @@ def _plain(value: Any) -> str:
             return _number(value, ".0f" if value.is_integer() and abs(value) < _WHOLE else ".4g")
         case dict():
             return (
-                ", ".join(f"{k} {in_words(each, _unit(k))}" for k, each in value.items()) or "none"
+                ", ".join(
+                    f"{FIGURES.get(k, (k,))[0]} {in_words(each, _unit(k))}"
+                    for k, each in value.items()
+                )
+                or "none"
             )
         case [] | () | None:
             return "none"

@@ -12,7 +12,7 @@ from equipix.bolometer.dynamic import DynamicCorrection
 from equipix.calibration.result import Calibration
 from equipix.comparison import Comparison
 from equipix.correction.protocol import Correction
-from equipix.findings import Flag
+from equipix.findings import Flag, usable
 from equipix.fitting.residuals import cell_side
 from equipix.measured.noise import BLOCK
 from equipix.measured.statistics import FrameStatistics
@@ -140,8 +140,9 @@ def _of_dynamic(correction: DynamicCorrection) -> Iterator[Map]:
     low, high = correction.axes.substrate_c
     middle = (low + high) / 2
     state = correction.correction(middle)
-    yield Map(f"Offset at {middle:.4g} °C", "DN", state.coefficients[0])
-    yield Map(f"Gain at {middle:.4g} °C", "", state.coefficients[1])
+    offset, gain = np.where(usable(state.flags), state.coefficients, np.nan)
+    yield Map(f"Offset at {middle:.4g} °C", "DN", offset)
+    yield Map(f"Gain at {middle:.4g} °C", "", gain)
 
 
 def _of_statistics(frames: FrameStatistics) -> Iterator[Map]:
@@ -160,7 +161,9 @@ def _of_scene(correction: SceneCorrection) -> Iterator[Map]:
 def _of_correction(correction: Correction) -> Iterator[Map]:
     names = ("Offset of the correction", "Gain of the correction")
     for power, plane in enumerate(correction.coefficients):
-        name = names[power] if power < len(names) else f"Coefficient of order {power}"
+        if power == 0 and not np.nan_to_num(plane).any():
+            continue  # of a gain alone
+        name = names[power] if power < len(names) else f"Coefficient of degree {power}"
         yield Map(name, ("DN", "", "1/DN", "1/DN²")[power], plane)
 
 
