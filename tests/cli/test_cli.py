@@ -132,7 +132,12 @@ def test_findings_and_rejected_values_are_reported(run, experiment, tmp_path):
 def test_inspect_shows_the_calibration(run, calibration):
     status, out, _ = run("inspect", calibration)
     assert status == 0
-    for line in (r"shape +64 × 80", r"converged +yes", r"flagged pixels +DO_NOT_USE 8"):
+    for line in (
+        r"shape +64 × 80",
+        r"converged +yes",
+        r"flagged pixels +DO_NOT_USE 8",
+        r"\n +p0 .* 1 +\[dark\] *\n",
+    ):
         assert re.search(line, out)
     assert re.search(r"shift sign +undetermined", out)
     assert re.search(r"orientation +the data do not determine.*compare the axes of the stage", out)
@@ -143,7 +148,8 @@ def test_inspect_shows_the_calibration(run, calibration):
     assert told["sensitivity_mean"] == pytest.approx(1)
     assert [each["shift"] for each in told["exposures"]] == saved.shifts.tolist()
     assert told["exposures"][0] | {"flux": 1} == {
-        "exposure": "p0", "shift": saved.shifts[0].tolist(), "shift_std": None, "flux": 1
+        "exposure": "p0", "shift": saved.shifts[0].tolist(), "shift_std": None, "flux": 1,
+        "dark": "[dark]",
     }  # fmt: skip
 
 

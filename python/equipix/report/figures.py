@@ -187,12 +187,14 @@ def _exposures(calibration: Calibration) -> Iterator[dict[str, Any]]:
     """Name, shift with its standard deviation where it is known, and flux of each exposure."""
     shifts, std = calibration.shifts, calibration.shift_std
     names = calibration.metadata.get("exposures", range(len(shifts)))
+    darks = calibration.metadata.get("darks", [""] * len(shifts))
     for number, name in enumerate(names):
         yield {
             "exposure": str(name),
             "shift": shifts[number].tolist(),
             "shift_std": None if std is None else std[number].tolist(),
             "flux": float(calibration.flux[number]),
+            "dark": darks[number] or None,
         }
 
 
