@@ -213,7 +213,8 @@ def _groups(folder: Path, start: Path) -> tuple[list[_Group], dict[str, str]]:
     groups: list[_Group] = []
     kinds = Counter(parent for (parent, *_), files in found.items() if files)
     for (parent, stem, _), counts in found.items():
-        name = parent.name if kinds[parent] == 1 and parent != folder else stem.rstrip(" -_.")
+        alone = kinds[parent] == 1 and parent != folder
+        name = parent.name if alone else stem.rstrip(" -_.")
         series = _by_settings([*counts], folder)
         for held, files in series:
             time = "" if len(series) == 1 or held.exposure_s is None else f"-{held.exposure_s:g}s"
@@ -229,7 +230,10 @@ def _groups(folder: Path, start: Path) -> tuple[list[_Group], dict[str, str]]:
             if len(files) > 1 and counts[files[0]] == 1:
                 groups.append(one)
                 continue
-            for part, file in zip(one.parts(), files, strict=True):
+            parts = one.parts()
+            if alone and len(files) == 1:
+                parts = [parts[0]._replace(name=one.name)]
+            for part, file in zip(parts, files, strict=True):
                 is_saved = counts[file] == 0
                 groups.append(part._replace(frames=counts[file] or 2, saved=is_saved))
     return groups, left
