@@ -291,11 +291,11 @@ def test_headers_of_fits_files_give_what_the_manifest_leaves_out(tmp_path, camer
     [
         (
             "exposure_s = 3\n\n",
-            r"'level2.fits' holds 2 s, but 'exposure_s' of level '1' is 3 s: correct 'exposure_s'",
+            r"'level2.fits' holds 2 s, but 'exposure_s' of level '2' is 3 s: correct 'exposure_s'",
         ),
         (
             "temperature_c = -12\n\n",
-            r"'level2.fits' holds -9.9 °C, but 'temperature_c' of level '1' is -12 °C",
+            r"'level2.fits' holds -9.9 °C, but 'temperature_c' of level '2' is -12 °C",
         ),
     ],
 )
@@ -308,10 +308,10 @@ def test_a_header_that_contradicts_the_manifest_is_named(tmp_path, camera, state
 def test_a_single_dark_of_other_settings_is_a_finding(tmp_path, camera):
     path = fits_levels(tmp_path, camera, dark_times=(16.0,))
     words = (
-        r"\[dark\] was taken with the exposure time 16 s, level '0' with 1 s by its files, and "
+        r"\[dark\] was taken with the exposure time 16 s, level '1' with 1 s by its files, and "
         r"likewise 2 more, .* give dark frames of 1 s; .* one \[\[dark\]\] for each exposure time"
     )
-    warm = r"\[dark\] was taken with the temperature -9.2 °C, level '0' with -9.95 °C .*limit 0.5 K"
+    warm = r"\[dark\] was taken with the temperature -9.2 °C, level '1' with -9.95 °C .*limit 0.5 K"
     with pytest.warns(errors.InputWarning, match=words), pytest.warns(match=warm):
         response = LevelExperiment.load(path).run()
     assert [each.kind for each in response.findings][:2] == ["other_dark"] * 2
@@ -349,7 +349,7 @@ def test_files_of_one_entry_that_contradict_one_another_are_named(tmp_path, came
     path.write_text(path.read_text().replace('"level2.fits"', '["level2.fits", "level3.fits"]', 1))
     path.write_text(path.read_text().replace('[[level]]\nframes = "level3.fits"\n', ""))
     words = (
-        r"the files of level '1' have different values of the exposure time: 'level2.fits' holds "
+        r"the files of level '2' have different values of the exposure time: 'level2.fits' holds "
         r"2 s, 'level3.fits' 3 s: give each exposure time a table of its own"
     )
     with pytest.raises(errors.FileError, match=words):

@@ -92,7 +92,7 @@ def _level_values(response: Response) -> dict[str, list[str]]:
         each["name"] if each["value"] is None else f"{each['value']:g} {each['unit'] or ''}"
         for each in levels
     ]
-    named = texts != [str(number) for number in range(len(levels))]
+    named = texts != [str(number + 1) for number in range(len(levels))]
     return {"level_values": [" ".join(each.split()) for each in texts]} if named else {}
 
 
