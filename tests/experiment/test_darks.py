@@ -108,6 +108,11 @@ def test_one_between_two_is_interpolated_with_its_variance(manifest):
     frames = equipix.average(manifest.parent / "2.npy", saturation=65535)
     wanted = frames.mean - (2 / 3 * low.mean + 1 / 3 * high.mean)  # 2 s between 1 s and 4 s
     np.testing.assert_allclose(cal.weighted.exposures.values[2], wanted, rtol=1e-6, atol=1e-3)
+    assert cal.metadata["darks"][::2] == [
+        "[[dark]] 2 (1 s)",
+        "0.667 × [[dark]] 2 (1 s) + 0.333 × [[dark]] 3 (4 s)",
+        "0.333 × [[dark]] 2 (1 s) + 0.667 × [[dark]] 3 (4 s)",
+    ]
     found = mixed([low, high], (2 / 3, 1 / 3))
     np.testing.assert_allclose(
         found.variance_of_mean, 4 / 9 * low.variance_of_mean + 1 / 9 * high.variance_of_mean
@@ -286,11 +291,11 @@ def test_headers_of_fits_files_give_what_the_manifest_leaves_out(tmp_path, camer
     [
         (
             "exposure_s = 3\n\n",
-            r"'level2.fits' holds 2 s, but 'exposure_s' of level '1' is 3 s: correct 'exposure_s'",
+            r"'level2.fits' holds 2 s, but 'exposure_s' of level '2' is 3 s: correct 'exposure_s'",
         ),
         (
             "temperature_c = -12\n\n",
-            r"'level2.fits' holds -9.9 °C, but 'temperature_c' of level '1' is -12 °C",
+            r"'level2.fits' holds -9.9 °C, but 'temperature_c' of level '2' is -12 °C",
         ),
     ],
 )
@@ -300,11 +305,53 @@ def test_a_header_that_contradicts_the_manifest_is_named(tmp_path, camera, state
         LevelExperiment.load(path).run()
 
 
+def test_a_single_dark_of_other_settings_is_a_finding(tmp_path, camera):
+    path = fits_levels(tmp_path, camera, dark_times=(16.0,))
+    words = (
+        r"\[dark\] was taken with the exposure time 16 s, level '1' with 1 s by its files, and "
+        r"likewise 2 more, .* give dark frames of 1 s; .* one \[\[dark\]\] for each exposure time"
+    )
+    warm = r"\[dark\] was taken with the temperature -9.2 °C, level '1' with -9.95 °C .*limit 0.5 K"
+    with pytest.warns(errors.InputWarning, match=words), pytest.warns(match=warm):
+        response = LevelExperiment.load(path).run()
+    assert [each.kind for each in response.findings][:2] == ["other_dark"] * 2
+    assert response.metadata["levels"][0]["dark"] == "[dark] (16 s, -9.2 °C)"
+
+
+def test_frames_of_one_average_have_one_exposure_time(tmp_path, camera, run):
+    fits_levels(tmp_path, camera)
+    output = tmp_path / "mean.tif"
+    status, _, err = run("average", tmp_path / "dark*.fits", "-o", output)
+    assert status == 1
+    assert "dark1.fits' holds the exposure time 1 s, '" in err
+    assert "dark4.fits' 4 s, expected one: average the frames of each" in err
+    assert not output.exists()
+
+
+def test_an_average_says_what_its_dark_was_taken_with(tmp_path, camera, run):
+    fits_levels(tmp_path, camera)
+    with fits.open(tmp_path / "level1.fits") as units:
+        units[0].header["CCD-TEMP"] = -12
+        units.writeto(tmp_path / "level1-cold.fits")
+    lights, output = [tmp_path / "level1.fits", tmp_path / "level1-cold.fits"], tmp_path / "m.tif"
+    status, _, err = run("average", *lights, "--dark", tmp_path / "dark4.fits", "-o", output)
+    assert status == 0
+    assert "'level1-cold.fits' was taken at -12 °C, 'level1.fits' at -9.95 °C (limit 0.5 K)" in err
+    assert "--dark was taken with the exposure time 4 s, 'level1.fits' with 1 s" in err
+    assert [each.kind for each in equipix.load(output).findings][:2] == [
+        "temperature",
+        "other_dark",
+    ]
+
+
 def test_files_of_one_entry_that_contradict_one_another_are_named(tmp_path, camera):
     path = fits_levels(tmp_path, camera)
     path.write_text(path.read_text().replace('"level2.fits"', '["level2.fits", "level3.fits"]', 1))
     path.write_text(path.read_text().replace('[[level]]\nframes = "level3.fits"\n', ""))
-    words = r"'level2.fits' holds 2 s, but the mean of level '1' is 2.5 s: .* the files of level"
+    words = (
+        r"the files of level '2' have different values of the exposure time: 'level2.fits' holds "
+        r"2 s, 'level3.fits' 3 s: give each exposure time a table of its own"
+    )
     with pytest.raises(errors.FileError, match=words):
         LevelExperiment.load(path).run()
 

@@ -120,15 +120,19 @@ class TestLevelExperiment:
         ("old", "new", "message"),
         [
             ("[[level]]", "[[levels]]", "unknown key 'levels'"),
-            ("value = 10", "valeu = 10", "unknown key 'valeu' in level 0"),
+            ("value = 10", "valeu = 10", "unknown key 'valeu' in [[level]] 1"),
             (
                 'value = 10\nunit = " °C"',
                 'unit = " °C"',
-                "'unit' is given without 'value' in level",
+                "'unit' is given without 'value' in [[level]]",
             ),
             ('"level1.tif"', '"none.tif"', "none.tif: does not exist"),
             ('"level2.tif"', '"level1.tif"', "'level1.tif' stands in 'frames' of level '10 °C'"),
-            ("value = 10", 'value = "warm"', "'value' in level 0 holds 'warm', expected a number"),
+            (
+                "value = 10",
+                'value = "warm"',
+                "'value' in [[level]] 1 holds 'warm', expected a number",
+            ),
             (
                 'value = 10\nunit = " °C"',
                 'value = 283\nunit = "K"',
@@ -173,7 +177,7 @@ class TestLevelExperiment:
         level = min(int(frame.min()) for frame in frames)
         text = text.replace("bit_depth = 14", f"bit_depth = 14\nsaturation = {level}")
         (folder / "bright.toml").write_text(text, encoding="utf-8")
-        message = rf"level 3 \('40 °C'\): 100.0% .* {level} DN .* 'saturation'"
+        message = rf"level '40 °C': 100.0% .* {level} DN .* 'saturation'"
         with pytest.raises(errors.FileError, match=message):
             LevelExperiment.load(folder / "bright.toml").run()
 
@@ -205,7 +209,7 @@ class TestCommands:
     def test_inspect_tells_names_where_levels_have_no_value(self, run, folder, tmp_path):
         names = '[[level]]\nframes = "{0}/level1.tif"\n[[level]]\nframes = "{0}/level2.tif"\n'
         text = names.format(folder)
-        for head, wanted in (("", None), ('name = "dim"\n', ["0", "dim"])):
+        for head, wanted in (("", None), ('name = "dim"\n', ["1", "dim"])):
             (tmp_path / "levels.toml").write_text(text + head, encoding="utf-8")
             response = LevelExperiment.load(tmp_path / "levels.toml").run()
             response.save(tmp_path / "response.npz", force=True)

@@ -87,13 +87,18 @@ def show_result(result: dict[str, Any], found: Findings | None = None, *, as_jso
     for name, words in rows:
         print(f"{name:<{width}}  {words}".replace("\n", "\n" + " " * (width + 2)))  # noqa: T201
     if 0 < len(exposures) <= _MOST_EXPOSURES:
-        show_table(
-            ("exposure", "shift ± standard deviation (row, col), pixels", "flux"),
-            [
-                (e["exposure"], pair_in_words(e["shift"], e["shift_std"]), f"{e['flux']:.5g}")
-                for e in exposures
-            ],
-        )
+        titles = ("exposure", "shift ± standard deviation (row, col), pixels", "flux", "dark")
+        listed: list[tuple[str, ...]] = [
+            (
+                e["exposure"],
+                pair_in_words(e["shift"], e["shift_std"]),
+                f"{e['flux']:.5g}",
+                e["dark"] or "not known",
+            )
+            for e in exposures
+        ]
+        known = 4 if any(e["dark"] for e in exposures) else 3
+        show_table(titles[:known], [row[:known] for row in listed])
 
 
 def show_saved(output: Path, result: _Saved, *, force: bool, as_json: bool) -> None:
@@ -109,7 +114,7 @@ def show_table(titles: Iterable[str], rows: Iterable[Iterable[str]]) -> None:
     shown = table.Table(*titles, box=box.SIMPLE_HEAD)
     for title, *cells in rows:
         shown.add_row(title, *(re.sub(_NO_NUMBER, "not determined", cell) for cell in cells))
-    console.Console(soft_wrap=True).print(shown)
+    console.Console(soft_wrap=True, markup=False).print(shown)
 
 
 def check_output(

@@ -96,7 +96,7 @@ def _level_values(response: Response) -> dict[str, list[str]]:
         each["name"] if each["value"] is None else f"{each['value']:g} {each['unit'] or ''}"
         for each in levels
     ]
-    named = texts != [str(number) for number in range(len(levels))]
+    named = texts != [str(number + 1) for number in range(len(levels))]
     return {"level_values": [" ".join(each.split()) for each in texts]} if named else {}
 
 
@@ -205,12 +205,14 @@ def _exposures(calibration: Calibration) -> Iterator[dict[str, Any]]:
     """Name, shift with its standard deviation where it is known, and flux of each exposure."""
     shifts, std = calibration.shifts, calibration.shift_std
     names = calibration.metadata.get("exposures", range(len(shifts)))
+    darks = calibration.metadata.get("darks", [""] * len(shifts))
     for number, name in enumerate(names):
         yield {
             "exposure": str(name),
             "shift": shifts[number].tolist(),
             "shift_std": None if std is None else std[number].tolist(),
             "flux": float(calibration.flux[number]),
+            "dark": darks[number] or None,
         }
 
 
