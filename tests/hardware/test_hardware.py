@@ -108,6 +108,26 @@ def test_wide_words_are_the_correction_within_half_a_step(seed, lowest):
     assert np.all(found[exact < -0.51] == 0)
 
 
+def test_steps_follow_that_of_the_adc():
+    rng = np.random.default_rng(1)
+    correction = polynomial(rng.uniform(-200, 20, SHAPE), rng.uniform(0.7, 1.3, SHAPE), shape=SHAPE)
+    options = {"adc_bits": 8, "adc_step": 16.0, "gain_bits": 8, "out_step": 2.0}
+    table = hardware.Table.of(correction, **options, lowest=37.0)
+    f = table.format
+    # A corrected value of 37 DN is 18.5 steps, rounded down. Pedestals are below 255 steps.
+    assert (f.zero, f.coarse) == (18, 4)
+    _, exact = exact_words(table, correction.coefficients)
+    words = np.arange(256, dtype=np.uint16)[:, None, None] + np.zeros(SHAPE, np.uint16)
+    away = np.abs(table.apply(words) - exact)[(exact > 0) & (exact < 2**16 - 1)].max()
+    told = table.metadata["largest_error_dn"] / 2.0
+    assert told - 0.5 <= away <= told + 0.5
+    # Where offsets are few steps, theirs is that of the product, or of a finer output.
+    for out_step, finest in ((2.0, -3), (2.0**-8, -8)):
+        even = hardware.Table.of(polynomial(0.0, 1.0), **options | {"out_step": out_step})
+        assert (even.format.gain, even.format.offset) == (-7, finest)
+    assert hardware.Table.of(correction, **options, dac_bits=0).format.coarse == 4
+
+
 @pytest.mark.parametrize("bits", [8, 10, 13])
 def test_narrow_words_are_off_by_no_more_than_their_steps(made, bits):
     response = made[1]
@@ -584,6 +604,8 @@ def test_corrections_without_use_are_refused():
         hardware.Table.of(polynomial(0.0, np.nan))
     with pytest.raises(errors.InputError, match="gain of 0 or below in 20 usable pixels"):
         hardware.Table.of(polynomial(0.0, -1.0))
+    with pytest.raises(errors.InputError, match="gain of 0 or below in 5 usable pixels"):
+        hardware.Table.of(polynomial(0.0, np.minimum(np.arange(4.0)[:, None], 1)))
     with pytest.raises(errors.InputError, match="expected a correction"):
         hardware.Table.of("response.tif")
 
@@ -685,6 +707,9 @@ def test_the_hash_is_that_of_the_correction(made):
     assert one == other
     changed = polynomial(*(made[1].coefficients + 1e-9), shape=SHAPE, flags=made[1].flags)
     assert hardware.Table.of(changed).metadata["sha256"] != one
+    flags = np.array(made[1].flags)
+    flags[0, 0] = Flag.SATURATED
+    assert hardware.Table.of(made[1].with_flags(flags)).metadata["sha256"] != one
 
 
 def test_the_cost_is_that_of_rounded_gains():
@@ -760,6 +785,8 @@ def test_the_worst_of_several_levels_counts_and_is_named(made, tmp_path, run):
     told, costs = json.loads(out), [hardware.quality(response, f, gain_bits=10) for f in levels]
     # The error of a gain grows with the distance from the middle of the ADC.
     assert costs[1].added > 2 * costs[0].added
+    # Words of the two bad pixels are 0, but do not count.
+    assert [each.at_ends for each in costs] == [0, 0]
     assert told["worst"] == {"frames": names[1]}
     assert told["added_noise"] == costs[1].added
     assert [each["added_noise"] for each in told["costs"]] == [each.added for each in costs]
