@@ -14,6 +14,8 @@ from equipix.comparison import Comparison
 from equipix.correction.protocol import Correction, sensor_of
 from equipix.diagnosis.coverage import FAR
 from equipix.findings import Findings, Flag, usable
+from equipix.hardware.table import Table
+from equipix.hardware.words import STEPS
 from equipix.io.record import Record
 from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.response import Response, common_misfit
@@ -55,6 +57,27 @@ def _of_correction(correction: Correction) -> dict[str, Any]:
         **{f"scene_{name}": learned[name] for name in _LEARNED if name in learned},
         "flagged_pixels": flagged(correction),
         **told(correction.findings),
+    }
+
+
+def of_table(table: Table) -> dict[str, Any]:
+    """Collect the main figures of a table of words."""
+    f, linearised = table.format, table.metadata.get("linearised")
+    form = asdict(f)
+    return {
+        **known(sensor=sensor_of(table)),
+        "shape": list(table.shape),
+        "bits": {name.removesuffix("_bits"): form[name] for name in form if "_bits" in name},
+        "steps": {name: 2.0 ** form[name] for name in STEPS if name != "coarse" or f.dac_bits},
+        "base": f.base,
+        "zero": f.zero,
+        "unusable_pixels": int((~usable(table.flags)).sum()),
+        "flagged_pixels": flagged(table),
+        **known(largest_error_dn=table.metadata.get("largest_error_dn")),
+        "rounding_dn": (2.0**f.out + 2.0 ** (f.adc + f.gain) * int(table.gain.max())) / 2,
+        **({"sag_dn": linearised["sag_dn"]} if linearised else {}),
+        **known(correction_sha256=table.metadata.get("sha256")),
+        **told(table.findings),
     }
 
 
@@ -297,6 +320,7 @@ _FIGURES: dict[type, Callable[[Any], dict[str, Any]]] = {
     Response: of_response,
     Comparison: of_comparison,
     DynamicCorrection: of_dynamic,
+    Table: of_table,
     **dict.fromkeys(METHODS.values(), of_scene),
 }
 """What collects the main figures of each kind of result."""
@@ -352,8 +376,11 @@ FIGURES = {
     "spatial_variance": ("spatial variance", "DN²"),
     "temporal_variance": ("temporal variance", "DN²"),
     "noise_variances": ("variances of noise", "DN²"),
-    "steps": ("steps, that of the gain a ratio", "DN"),
-    "largest_error_dn": ("largest error", "DN"),
+    "steps": ("steps in DN, that of the gain a ratio", ""),
+    "base": ("output of the sum 0", "steps of the output"),
+    "zero": ("corrected value of the output 0", "steps of the output"),
+    "largest_error_dn": ("largest error of rounded gains and offsets", "DN"),
+    "rounding_dn": ("beside it, by rounding of ADC and output", "DN"),
     "sag_dn": ("sag of the line", "DN"),
 }
 """Names and units of figures; of all others the name is the key, and there is no unit."""
