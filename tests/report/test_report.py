@@ -280,7 +280,7 @@ class TestCamera:
         assert "exists" in told
 
     def test_planes_are_parts_and_columns(self, tmp_path, run):
-        path, out = written_camera(tmp_path, cfa="RGGB", count=6, spatial=0), tmp_path / "it.html"
+        path, out = written_camera(tmp_path, cfa="RGGB", count=18, spatial=0), tmp_path / "it.html"
         status, printed, told = run("emva", path, "-o", out)
         assert (status, told) == (0, "")
         text = out.read_text(encoding="utf-8")

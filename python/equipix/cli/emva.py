@@ -8,7 +8,7 @@ import typer
 from equipix.cli import terminal
 from equipix.experiment.camera import CameraExperiment
 from equipix.io.paths import refuse_inputs
-from equipix.report.camera import camera_parts, figures_of
+from equipix.report.camera import bounds_of, camera_parts, figures_of, rows_of
 from equipix.report.figures import told
 from equipix.report.page import page, write_page
 
@@ -36,15 +36,15 @@ def emva(
         write_page(output, text, force=force)
     if as_json:
         result = {
-            name: {each.key: each.value for each in figures_of(found)} | told(found.findings)
+            name: {each.key: each.value for each in figures_of(found)}
+            | {"bounds": bounds_of(found)}
+            | told(found.findings)
             for name, found in planes.items()
         }
         terminal.show_result(
-            {"output": str(output or "none")} | result.get("", result), as_json=True
+            {"output": output and str(output)} | result.get("", result), as_json=True
         )
         return
-    rows = zip(*map(figures_of, planes.values()), strict=True)
-    terminal.show_table(
-        ("figure", "unit", *planes),
-        ((each[0].name, each[0].unit, *(figure.number for figure in each)) for each in rows),
-    )
+    terminal.show_table(("figure", "unit", *planes), rows_of(planes))
+    if output is not None:
+        terminal.show_result({"output": str(output)}, as_json=False)

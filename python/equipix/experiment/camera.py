@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from equipix._check import Floats, Ints, Progress, ReadOnly, naming_memory
+from equipix._check import Floats, Progress, ReadOnly, naming_memory
 from equipix.detector.photons import EV_UM
 from equipix.errors import FileError, InputError
 from equipix.experiment.described import Described
@@ -22,23 +22,35 @@ from equipix.experiment.manifest import (
 )
 from equipix.findings import Finding, Rule, ask, say
 from equipix.io.paths import as_path
-from equipix.measured.colour import Colours
+from equipix.measured.colour import Colours, Filters, advice
 from equipix.measured.statistics import FrameStatistics
 from equipix.metrics.emva import (
     MOST_EFFICIENT,
     QUANTISED,
+    TRANSFER,
     EmvaSpatial,
     EmvaTransfer,
     emva_spatial,
+    linear_levels,
     mean_and_variance,
     transfer_of,
 )
-from equipix.metrics.maps import planes
+from equipix.metrics.maps import places_of
 
 _DESCRIPTOR = "EMVA1288_Data.txt"
 
 _FALLEN = 0.9
 """Variance at the brightest level over the largest, up to which it has fallen by saturation."""
+
+_LEVELS = 9
+"""Levels between 5 and 95 % of saturation that the standard wants for the linearity."""
+
+_FRAMES = 16
+"""Fewest frames for a non-uniformity: of fewer it is little more than what noise leaves."""
+
+_Place = tuple[slice, slice]
+
+_ALL: _Place = np.s_[:, :]
 
 _JOULE_PER_EV = 1.602176634e-19
 
@@ -59,6 +71,8 @@ class CameraFigures(ReadOnly):
         Mean and temporal variance of each level with light and without it, in DN and DN².
     bright, dark : ndarray, shape (rows, cols), or None
         Mean of the frames of `spatial`, in DN.
+    frames : tuple of int
+        Numbers of frames of `spatial`, with light and without.
     findings : tuple of Finding
         What limits the figures.
     metadata : dict
@@ -73,8 +87,30 @@ class CameraFigures(ReadOnly):
     off: Floats
     bright: Floats | None
     dark: Floats | None
+    frames: tuple[int, int] = (0, 0)
     findings: tuple[Finding, ...] = ()
     metadata: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def is_saturated(self) -> bool:
+        """Whether the noise falls towards the brightest level, as it does by saturation."""
+        return bool(self._share <= _FALLEN)
+
+    @property
+    def is_quantised(self) -> bool:
+        """Whether quantisation hides the temporal dark noise."""
+        noise = self.transfer.dark_noise_dn
+        return noise < QUANTISED**0.5 and not (noise < 0 and self._least >= QUANTISED)
+
+    @property
+    def _share(self) -> float:
+        """Variance at the brightest level over the largest."""
+        return float(self.on[self.on[:, 0].argmax(), 1] / self.on[:, 1].max())
+
+    @property
+    def _least(self) -> float:
+        """Smallest variance of a dark."""
+        return float(self.off[:, 1].min())
 
 
 @dataclass(frozen=True)
@@ -169,7 +205,9 @@ class CameraExperiment(Described[CameraManifest]):
         Warns
         -----
         InputWarning
-            If saturation is not reached, or the photons give no quantum efficiency.
+            Of each finding: saturation is not reached, levels or frames are few, exposure times
+            determine no dark current, quantisation hides the noise, the photons give no quantum
+            efficiency, or the image shows colours that `cfa` does not name.
 
         Notes
         -----
@@ -179,21 +217,43 @@ class CameraExperiment(Described[CameraManifest]):
         """
         shape = self._shape()
         colours = Colours.of(self.manifest.sensor.cfa)
-        places = {"": np.arange(shape[0] * shape[1]).reshape(shape)}
-        if colours is not None:
-            places = planes(places[""], colours)
+        places = {"": _ALL} if colours is None else places_of(colours)
         origin = self._provenance(sha256_of([self.path, *self.files()]), None)
         with naming_memory("averaging"):
             found = {
                 plane: self._evaluated(plane, partial(self._mean, place, shape, workers), progress)
                 for plane, place in places.items()
             }
-        say(*(each for one in found.values() for each in one.findings))
-        return {plane: replace(one, metadata=origin) for plane, one in found.items()}
+            mixed = _of_filters(self._filters(colours, [*found.values()], shape, workers))
+        say(*mixed, *(each for one in found.values() for each in one.findings))
+        return {
+            plane: replace(one, findings=mixed + one.findings, metadata=origin)
+            for plane, one in found.items()
+        }
+
+    def _filters(
+        self,
+        colours: Colours | None,
+        found: list[CameraFigures],
+        shape: tuple[int, int],
+        workers: int | None,
+    ) -> Filters | None:
+        """Find colours in the brightest level that is well below saturation in all planes."""
+        signals = np.array([one.on[:, 0] - one.off[:, 0] for one in found])
+        most = [[TRANSFER * one.transfer.saturation_dn] for one in found]
+        levels = np.flatnonzero(np.all(signals <= most, axis=0))
+        if not levels.size:
+            return None
+        name, entry = self.manifest.series[levels[signals[0, levels].argmax()]]
+        bright, dark = (
+            self._mean(_ALL, shape, workers, f"'{key}' of exposure '{name}'", files).mean
+            for key, files in (("frames", entry.frames), ("dark", entry.dark))
+        )
+        return Filters.of(colours, bright - dark)
 
     def _mean(
         self,
-        place: Ints,
+        place: _Place,
         shape: tuple[int, int],
         workers: int | None,
         at: str,
@@ -201,10 +261,12 @@ class CameraExperiment(Described[CameraManifest]):
     ) -> FrameStatistics:
         """Average the frames of an entry in the pixels of a plane, as an image of their own."""
         mask = np.ones(shape, bool)
-        mask.flat[place] = False
+        mask[place] = False
         # With a mask a saved average loses the light between its frames.
         found = self._statistics(at, files, None, workers, None, mask if mask.any() else None)
-        maps: dict[str, Any] = {name: each.flat[place] for name, each in found.maps.items()}
+        maps: dict[str, Any] = {
+            name: np.ascontiguousarray(each[place]) for name, each in found.maps.items()
+        }
         return replace(found, **maps)
 
     def _shape(self) -> tuple[int, int]:
@@ -226,6 +288,7 @@ class CameraExperiment(Described[CameraManifest]):
         times = np.array([each.exposure_s for each in exposures])
         on, off = curve = np.empty((2, len(exposures), 2))
         spatial = bright = dark = None
+        frames = 0, 0
         at = ""
         try:
             for k, (name, each) in enumerate(self.manifest.series[: len(exposures)]):
@@ -235,15 +298,17 @@ class CameraExperiment(Described[CameraManifest]):
                 if progress is not None:
                     progress(k + 1, len(exposures), f"averaging levels {plane}".strip())
             at = f"plane {plane}" if plane else "levels"
-            transfer = transfer_of(on, off, photons, times)
+            names = [f"exposure '{name}'" for name, _ in self.manifest.series]
+            transfer = transfer_of(on, off, photons, times, "the light in photons", names)
             if entry is not None:
                 at = "[spatial]"
                 stacks = read(at, entry.frames), read(at, entry.dark)
                 spatial = emva_spatial(*stacks, gain_dn_per_e=transfer.gain_dn_per_e)
                 bright, dark = (each.mean for each in stacks)
+                frames = int(stacks[0].count.min()), int(stacks[1].count.min())
         except InputError as error:
             raise FileError(f"{self.path}, {at}: {error}") from error
-        found = CameraFigures(transfer, spatial, photons, times, on, off, bright, dark)
+        found = CameraFigures(transfer, spatial, photons, times, on, off, bright, dark, frames)
         of = f"plane {plane}: " if plane else ""
         said = (replace(each, message=of + each.message) for each in ask(_CAMERA, found))
         return replace(found, findings=tuple(said))
@@ -255,6 +320,32 @@ def _photons(exposure: CameraExposure, light: CameraLight | None) -> float:
         return float(exposure.photons or 0.0)
     joule = exposure.irradiance_uw_cm2 * 1e-14 * light.pixel_um**2 * exposure.exposure_s
     return joule * light.wavelength_nm * 1e-3 / (EV_UM * _JOULE_PER_EV)
+
+
+def _of_filters(filters: Filters | None) -> tuple[Finding, ...]:
+    """Say that the image shows colours that 'cfa' does not name."""
+    if filters is None or (filters.given and filters.shown is None):
+        return ()
+    shown = filters.shown or filters.colours
+    rows, cols = shown.period
+    repeats = f"the response repeats every {rows} rows and {cols} columns"
+    if filters.shown is not None:
+        words = (
+            f"{repeats} otherwise than 'cfa' in [sensor], '{filters.colours}', so planes have "
+            f"wrong colours or mix them: {advice(shown)}"
+        )
+    elif min(rows, cols) > 1:
+        words = (
+            f"{repeats} by {filters.spread:.0%}, as under colour filters, and no 'cfa' is given in "
+            f"[sensor], so the figures mix the colours and PRNU contains them: {advice(shown)}"
+        )
+    else:
+        words = (
+            f"{repeats} by {filters.spread:.0%}, as channels of the read-out have it, and PRNU "
+            "contains that. Adjust the gains of the channels; name stripes of colours by 'cfa' in "
+            "[sensor]"
+        )
+    return (Finding("cfa", words, "misfit", "warning" if min(rows, cols) > 1 else "note"),)
 
 
 def _on_unit(found: CameraFigures) -> str | None:
@@ -271,31 +362,85 @@ def _on_unit(found: CameraFigures) -> str | None:
 
 def _on_saturation(found: CameraFigures) -> str | None:
     """Say that the noise does not fall towards the brightest level."""
-    share = found.on[found.on[:, 0].argmax(), 1] / found.on[:, 1].max()
-    if not share > _FALLEN:
+    if found.is_saturated:
         return None
     return (
-        f"the variance at the brightest level is {share:.0%} of the largest (limit {_FALLEN:.0%}), "
-        "so saturation is not reached: saturation capacity, SNR and dynamic range are lower "
-        "bounds. Add levels with more light, up to where the noise falls"
+        f"the variance at the brightest level is {found._share:.0%} of the largest (limit "
+        f"{_FALLEN:.0%}), so saturation is not reached: saturation capacity, SNR and dynamic range "
+        "are lower bounds. Add levels with more light, up to where the noise falls"
+    )
+
+
+def _on_levels(found: CameraFigures) -> str | None:
+    """Say that the linearity is judged by few levels."""
+    signal = found.on[:, 0] - found.off[:, 0]
+    count = np.count_nonzero(linear_levels(signal, found.transfer.saturation_dn))
+    if count >= _LEVELS:
+        return None
+    return (
+        f"{count} levels lie between 5 and 95 % of saturation (limit {_LEVELS}), so the linearity "
+        "error says little, and saturation lies somewhere between two levels: add levels, 50 in all"
+    )
+
+
+def _on_frames(found: CameraFigures) -> str | None:
+    """Say that the non-uniformity is judged by few frames."""
+    if found.spatial is None or min(found.frames) >= _FRAMES:
+        return None
+    lit, dark = found.frames
+    return (
+        f"[spatial] has {lit} frames with light and {dark} without (limit {_FRAMES}), whose noise "
+        "DSNU and PRNU are freed of but for its error: give 100 or more of each"
+    )
+
+
+def _on_times(found: CameraFigures) -> str | None:
+    """Say that the noise of the darks contradicts their exposure times."""
+    noise = found.transfer.dark_noise_dn
+    if noise >= 0 or found.is_quantised:
+        return None
+    return (
+        f"the variance of the darks is from {found._least:.3g} DN² on, and over their exposure "
+        f"times it falls to {-(noise**2):.3g} DN² at the time 0, which no noise has: dark noise, "
+        "sensitivity threshold and dynamic range are wrong. See that each 'exposure_s' is that of "
+        "its frames, in seconds"
+    )
+
+
+def _on_spread(found: CameraFigures) -> str | None:
+    """Say that the exposure times differ, but not by enough."""
+    times, t = np.unique(found.exposure_s), found.transfer
+    unknown = np.isnan(t.dark_current_mean) or (
+        np.isnan(t.dark_current_variance) and found._least >= QUANTISED
+    )
+    if len(times) < 3 or not unknown:
+        return None
+    return (
+        f"exposure times from {times[0]:.6g} to {times[-1]:.6g} s determine the noise of the darks "
+        "at the time 0, or their current, to no better than half of the noise: what is not known "
+        "is left out, and dark noise is that of the darks as they are. Spread the exposure times"
     )
 
 
 def _on_quantisation(found: CameraFigures) -> str | None:
     """Say that the noise of the dark is hidden by rounding."""
-    noise, least = found.transfer.dark_noise_dn, QUANTISED**0.5
-    if noise >= least:
+    if not found.is_quantised:
         return None
     return (
-        f"the temporal dark noise is {noise:.3g} DN, and quantisation hides noise "
-        f"below {least:.2g} DN: sensitivity threshold and dynamic range count {least:.2g} DN. Use "
-        "a higher gain of the camera"
+        f"the temporal dark noise is {found.transfer.dark_noise_dn:.3g} DN, and quantisation hides "
+        f"noise below {QUANTISED**0.5:.2g} DN: dark noise and sensitivity threshold are upper "
+        "bounds, dynamic range is a lower one. Variances give no dark current, and means one with "
+        "errors of rounding. Use a higher gain of the camera"
     )
 
 
 _CAMERA: tuple[Rule[CameraFigures], ...] = (
     Rule("unit", "input", _on_unit),
     Rule("saturation", "input", _on_saturation),
+    Rule("levels", "input", _on_levels, severity="note"),
+    Rule("frames", "input", _on_frames, severity="note"),
+    Rule("times", "input", _on_times),
+    Rule("spread", "input", _on_spread, severity="note"),
     Rule("quantisation", "input", _on_quantisation, severity="note"),
 )
 """What is asked of the figures of a camera."""

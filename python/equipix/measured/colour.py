@@ -227,7 +227,7 @@ class Filters:
             return (
                 f"pixels of one colour of 'cfa' differ by more than {_CONTRADICTS:.0%}: the "
                 f"response repeats every {rows} rows and {cols} columns otherwise than "
-                f"'{self.colours}', so colours are mixed: {_advice(self.shown)}"
+                f"'{self.colours}', so colours are mixed: {advice(self.shown)}"
             )
         if min(rows, cols) == 1:
             axis, period = ("columns", cols) if rows == 1 else ("rows", rows)
@@ -239,7 +239,7 @@ class Filters:
         return (
             f"the response repeats every {rows} rows and {cols} columns by {self.spread:.0%}, as "
             f"under colour filters, and no 'cfa' is given. No pixel is flagged for it, but M mixes "
-            f"the colours, and a corrected frame loses its white balance: {_advice(self.colours)}"
+            f"the colours, and a corrected frame loses its white balance: {advice(self.colours)}"
         )
 
     @property
@@ -252,7 +252,8 @@ class Filters:
         return self.colours.map_of(self.response, shape)
 
 
-def _advice(colours: Colours) -> str:
+def advice(colours: Colours) -> str:
+    """Say which 'cfa' to write for a pattern that values show."""
     named = _bayer(colours)
     write = " or ".join(f"cfa={each!r}" for each in named or [str(colours)])
     return (

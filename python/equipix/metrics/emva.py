@@ -203,7 +203,7 @@ _SEQUENCES = (list, tuple, np.ndarray)
 TRANSFER = 0.7
 """Highest signal, over that at saturation, that counts for gain and responsivity."""
 
-LINEAR = (0.05, 0.95)
+_LINEAR = (0.05, 0.95)
 """Lowest and highest signal, over that at saturation, that count for the linearity."""
 
 QUANTISED = 0.24
@@ -211,6 +211,12 @@ QUANTISED = 0.24
 
 _TIMES = 3
 """Fewest exposure times of which a dark current is determined."""
+
+_HALF = 0.5
+"""Largest error of mean and variance at the time 0, over the noise and the variance of a dark."""
+
+_STUDENT = (12.71, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306)
+"""Student's t that 95 % lie within, by the degrees of freedom from 1 on."""
 
 
 @dataclass(frozen=True)
@@ -239,10 +245,12 @@ class EmvaTransfer(Brief):
     saturation_light : float
         Light at saturation: the saturation capacity in photons, where the light is in photons.
     dark_noise_dn : float
-        Temporal noise of a frame without light, quantisation included, in DN.
+        Temporal noise of a frame without light, quantisation included, in DN. Below 0.49 DN
+        quantisation hides it: this number and `read_noise_e` then state no more than that they are
+        below 0.49 DN and 0.40/K.
     dark_current_mean, dark_current_variance : float
-        Electrons per second by the means and by the variances of the darks; NaN without three
-        exposure times.
+        Electrons per second by the means and by the variances of the darks; NaN where the exposure
+        times do not determine it. By the variances also NaN where quantisation hides one.
     """
 
     gain_dn_per_e: float
@@ -325,8 +333,8 @@ def emva_transfer(
     light : array_like, shape (levels,)
         Light of each level: photons per pixel, or in any unit.
     exposure_s : array_like, shape (levels,), optional
-        Exposure time of each level and its dark, in seconds. Where three or more differ, the noise
-        without light is that at the time 0, and there is a dark current.
+        Exposure time of each level and its dark, in seconds. Where they determine them, the noise
+        without light is that at the time 0, and there is a dark current: see the notes.
 
     Returns
     -------
@@ -361,7 +369,9 @@ def emva_transfer(
 
     There a variance without light counts as 0.24 DN² at least. The dark current is the slope of
     the means of the darks over the exposure time, divided by K, and that of their variances,
-    divided by K².
+    divided by K². A line counts if its error at the time 0, of 95 % by Student's t, is at most half
+    of the noise of a dark, or half of its variance: times that hardly differ determine none. σ_d
+    is then that of the darks as they are.
 
     References
     ----------
@@ -396,14 +406,24 @@ def emva_transfer(
     return found
 
 
-def transfer_of(on: Floats, off: Floats, levels: Floats, times: Floats | None) -> EmvaTransfer:
-    """Evaluate means and variances (levels, 2) with light and without; see `emva_transfer`."""
+def transfer_of(
+    on: Floats,
+    off: Floats,
+    levels: Floats,
+    times: Floats | None,
+    light: str = "'light'",
+    names: Sequence[str] = (),
+) -> EmvaTransfer:
+    """Evaluate means and variances (levels, 2) with light and without; see `emva_transfer`.
+
+    Messages call the light and the levels as given; without names levels are numbered.
+    """
     signal, variance = (on - off).T
     _refuse_dark(off[:, 0], on[:, 0])
     largest = int(np.argmax(on[:, 1]))
     saturation = float(signal[largest])
     below = signal <= TRANSFER * saturation
-    linear = (signal >= LINEAR[0] * saturation) & (signal <= LINEAR[1] * saturation)
+    linear = linear_levels(signal, saturation)
     if np.count_nonzero(linear) < 3 or not (signal[below] > 0).any():
         raise InputError(
             f"'frames': {np.count_nonzero(linear)} levels lie between 5 and 95 % of saturation at "
@@ -411,19 +431,30 @@ def transfer_of(on: Floats, off: Floats, levels: Floats, times: Floats | None) -
         )
     if not np.ptp(levels[linear]) > 0:
         raise InputError(
-            f"'light' is {levels[linear][0]:g} at all levels between 5 and 95 % of saturation, "
+            f"{light} is {levels[linear][0]:g} at all levels between 5 and 95 % of saturation, "
             "expected values that rise with the signal"
         )
     if not levels[below].any():
-        raise InputError("'light' is 0 at all levels up to 70 % of saturation, expected light")
-    _refuse_falling(levels, signal, linear)
+        raise InputError(f"{light} is 0 at all levels up to 70 % of saturation, expected light")
+    if (falls := _falling(levels, signal, linear)) is not None:
+        at = [names[k] if names else f"level {k}" for k in falls]
+        (weak, strong), (high, low) = levels[falls], signal[falls]
+        raise InputError(
+            f"{light} is {weak:g} at {at[0]} and {strong:g} at {at[1]}, where the signal is "
+            f"{high:.6g} and {low:.6g} DN: expected light that rises with the signal, one value "
+            "for each level" + ("" if names else " in the order of 'frames'")
+        )
     gain = _slope(signal[below], variance[below])
     responsivity = _slope(levels[below], signal[below])
     if not gain > 0:
         raise InputError(f"'frames': the noise does not rise with the signal, the gain is {gain:g}")
     dark_variance, slopes = float(off[:, 1].mean()), np.full(2, np.nan)
     if times is not None and len(np.unique(times)) >= _TIMES:
-        slopes, (_, dark_variance) = np.polyfit(times, off, 1)
+        slopes, (_, at_zero) = _lines(times, off)
+        if off[:, 1].min() < QUANTISED:
+            slopes[1], dark_variance = np.nan, float(np.fmin(at_zero, off[:, 1].min()))
+        elif np.isfinite(at_zero):
+            dark_variance = float(at_zero)
     efficiency = responsivity / gain
     line = _line(levels[linear], signal[linear])
     fitted = line[0] + line[1] * levels[linear]
@@ -442,10 +473,30 @@ def transfer_of(on: Floats, off: Floats, levels: Floats, times: Floats | None) -
     )
 
 
+def _lines(times: Floats, off: Floats) -> tuple[Floats, Floats]:
+    """Slopes of mean and variance (levels, 2) over time, and values at 0; NaN if not determined."""
+    middle, freedom = times.mean(), len(times) - 2
+    spread = np.sum((times - middle) ** 2)
+    slopes = (times - middle) @ off / spread
+    left = off - off.mean(axis=0) - np.outer(times - middle, slopes)
+    error = np.sqrt(np.sum(left**2, axis=0) / freedom * (1 / len(times) + middle**2 / spread))
+    error *= _STUDENT[min(freedom, len(_STUDENT)) - 1]
+    variance = max(float(off[:, 1].mean()), QUANTISED)
+    known = error <= _HALF * np.array([np.sqrt(variance), variance])
+    lines = np.stack([slopes, off.mean(axis=0) - middle * slopes])
+    slopes, at_zero = np.where(known, lines, np.nan)
+    return slopes, at_zero
+
+
 def mean_and_variance(name: str, frames: ArrayLike | FrameStatistics) -> tuple[float, float]:
     """Mean of all values, and temporal variance of one frame."""
     found = moments(name, frames)
     return float(found.mean.mean()), found.variance
+
+
+def linear_levels(signal: Floats, saturation: float) -> Bools:
+    """Levels that count for the linearity."""
+    return np.asarray((signal >= _LINEAR[0] * saturation) & (signal <= _LINEAR[1] * saturation))
 
 
 def _refuse_dark(dark: Floats, bright: Floats) -> None:
@@ -457,19 +508,14 @@ def _refuse_dark(dark: Floats, bright: Floats) -> None:
         )
 
 
-def _refuse_falling(light: Floats, signal: Floats, linear: Bools) -> None:
-    """Refuse light that is not that of its levels: a signal that falls where the light rises."""
+def _falling(light: Floats, signal: Floats, linear: Bools) -> list[int] | None:
+    """Two levels of which the second has more light and less signal, if there are any."""
     order = np.flatnonzero(linear)[np.lexsort((signal[linear], light[linear]))]
     highest = np.maximum.accumulate(signal[order])
     falls = np.flatnonzero(signal[order] < (1 - _LOWER) * highest)
-    if falls.size:
-        after = order[falls[0]]
-        before = order[int(np.argmax(signal[order[: falls[0]]]))]
-        raise InputError(
-            f"'light' is {light[before]:g} at level {before} and {light[after]:g} at level {after},"
-            f" where the signal is {signal[before]:.6g} and {signal[after]:.6g} DN: expected light "
-            "that rises with the signal, one value for each level in the order of 'frames'"
-        )
+    if not falls.size:
+        return None
+    return [int(order[np.argmax(signal[order[: falls[0]]])]), int(order[falls[0]])]
 
 
 def _slope(x: Floats, y: Floats) -> float:

@@ -324,14 +324,20 @@ def planes(frames: ArrayLike, cfa: ArrayLike | Colours) -> dict[str, Array]:
         raise InputError(
             f"'frames' has shape {array.shape}, smaller than a period of {down}×{right}"
         )
-    several = Counter(label for row in colours.pattern for label in row)
-    found: dict[str, Array] = {}
+    return {name: array[..., *place] for name, place in places_of(colours).items()}
+
+
+def places_of(colours: Colours) -> dict[str, tuple[slice, slice]]:
+    """Rows and columns of each plane, by the names of `planes`."""
+    (down, right), pattern = colours.period, colours.pattern
+    several = Counter(label for row in pattern for label in row)
+    found: dict[str, tuple[slice, slice]] = {}
     numbers = Counter[str]()
     for row, col in np.ndindex(down, right):
-        label = colours.pattern[row][col]
+        label = pattern[row][col]
         numbers[label] += 1
         name = label if several[label] == 1 else f"{label}{numbers[label]}"
-        found[name] = array[..., row::down, col::right]
+        found[name] = np.s_[row::down, col::right]
     return found
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from equipix._check import Floats
 from equipix.experiment.camera import CameraFigures
-from equipix.metrics.emva import LINEAR, TRANSFER, Split, high_passed
+from equipix.metrics.emva import QUANTISED, TRANSFER, Split, high_passed, linear_levels
 from equipix.report.drawing import draw_histogram, draw_spectrum
 from equipix.report.maps import Map
 from equipix.report.page import LARGEST, Part, Table, drawn, mapped, provenance_of
@@ -26,40 +26,62 @@ _FINE: Any = {"linewidth": 0.8}
 
 
 class Figure(NamedTuple):
-    """A figure: its key, its name and unit for people, and its value, NaN where it is not known."""
+    """A figure: its key, its name and unit for people, and its value, NaN where it is not known.
+
+    `told` says that the value is a bound, "below" or "above"; of none, why it is not known.
+    """
 
     key: str
     name: str
     unit: str
     value: float
+    told: str = ""
 
     @property
     def number(self) -> str:
         """The value in digits."""
         if not np.isfinite(self.value):
-            return "not known"
-        return f"{self.value:{'.0f' if abs(self.value) >= _WHOLE else '.4g'}}"
+            return self.told or "not known"
+        number = f"{self.value:{'.0f' if abs(self.value) >= _WHOLE else '.4g'}}"
+        return f"{self.told} {number}".strip()
+
+
+def bounds_of(found: CameraFigures) -> dict[str, str]:
+    """Keys of the figures that are bounds, "below" or "above", for programs."""
+    return {
+        each.key: each.told for each in figures_of(found) if each.told and np.isfinite(each.value)
+    }
 
 
 def figures_of(found: CameraFigures) -> Iterator[Figure]:
     """List all figures, those of the non-uniformity where it was measured."""
-    t = found.transfer
+    t, of_noise, of_light = found.transfer, "", ""
+    dark_dn, dark_e = t.dark_noise_dn, t.read_noise_e
+    if found.is_quantised:
+        of_noise = "below"
+        dark_dn, dark_e = np.sqrt([QUANTISED, QUANTISED - 1 / 12]) / (1, t.gain_dn_per_e)
+    if not found.is_saturated:
+        of_light = "above"
+    of_range = of_light or ("above" if of_noise else "")
     yield Figure("gain_dn_per_e", "system gain K", "DN/e⁻", t.gain_dn_per_e)
     yield Figure("inverse_gain_e_per_dn", "1/K", "e⁻/DN", 1 / t.gain_dn_per_e)
-    yield Figure("responsivity_dn_per_photon", "responsivity R", "DN/photon", t.responsivity)
-    efficiency = 100 * t.quantum_efficiency
-    yield Figure("quantum_efficiency_percent", "quantum efficiency η", "%", efficiency)
-    yield Figure("dark_noise_dn", "temporal dark noise with quantisation", "DN", t.dark_noise_dn)
-    yield Figure("dark_noise_e", "temporal dark noise σ_d", "e⁻", t.read_noise_e)
-    yield from _with_logarithms("snr_max", "largest SNR", t.snr_max)
-    yield Figure("inverse_snr_max_percent", "inverse of the largest SNR", "%", 100 / t.snr_max)
-    for key, name, photons, electrons in (
-        ("threshold", "absolute sensitivity threshold", t.threshold_light, t.threshold_e),
-        ("saturation", "saturation capacity", t.saturation_light, t.saturation_e),
+    key, unit = "responsivity_dn_per_photon", "DN/photon"
+    yield _in_photons(found, Figure(key, "responsivity R", unit, t.responsivity))
+    key, efficiency = "quantum_efficiency_percent", 100 * t.quantum_efficiency
+    yield _in_photons(found, Figure(key, "quantum efficiency η", "%", efficiency))
+    name = "temporal dark noise with quantisation"
+    yield Figure("dark_noise_dn", name, "DN", float(dark_dn), of_noise)
+    yield Figure("dark_noise_e", "temporal dark noise σ_d", "e⁻", float(dark_e), of_noise)
+    yield from _with_logarithms("snr_max", "largest SNR", t.snr_max, of_light)
+    name, inverse = "inverse of the largest SNR", 100 / t.snr_max
+    yield Figure("inverse_snr_max_percent", name, "%", inverse, "below" if of_light else "")
+    for key, name, photons, electrons, told in (
+        ("threshold", "absolute sensitivity threshold", t.threshold_light, t.threshold_e, of_noise),
+        ("saturation", "saturation capacity", t.saturation_light, t.saturation_e, of_light),
     ):
-        yield Figure(f"{key}_photons", name, "photons", photons)
-        yield Figure(f"{key}_e", name, "e⁻", electrons)
-    yield from _with_logarithms("dynamic_range", "dynamic range", t.dynamic_range)
+        yield _in_photons(found, Figure(f"{key}_photons", name, "photons", photons, told))
+        yield Figure(f"{key}_e", name, "e⁻", electrons, told)
+    yield from _with_logarithms("dynamic_range", "dynamic range", t.dynamic_range, of_range)
     if found.spatial is not None:
         dsnu, prnu = found.spatial.dsnu, found.spatial.prnu
         yield Figure("dsnu_dn", "DSNU", "DN", dsnu.total * t.gain_dn_per_e)
@@ -78,10 +100,26 @@ def _parts(kind: str, ending: str, unit: str, split: Split) -> Iterator[Figure]:
         yield Figure(f"{kind}_{part}{ending}", f"{kind.upper()}, {part}", unit, value)
 
 
-def _with_logarithms(key: str, name: str, ratio: float) -> Iterator[Figure]:
-    yield Figure(key, name, "", ratio)
-    yield Figure(f"{key}_db", name, "dB", float(20 * np.log10(ratio)))
-    yield Figure(f"{key}_bits", name, "bit", float(np.log2(ratio)))
+def _with_logarithms(key: str, name: str, ratio: float, told: str) -> Iterator[Figure]:
+    yield Figure(key, name, "", ratio, told)
+    yield Figure(f"{key}_db", name, "dB", float(20 * np.log10(ratio)), told)
+    yield Figure(f"{key}_bits", name, "bit", float(np.log2(ratio)), told)
+
+
+def _has_photons(found: CameraFigures) -> bool:
+    """Whether the light can be in photons: otherwise there is no quantum efficiency."""
+    return bool(np.isfinite(found.transfer.quantum_efficiency))
+
+
+def _in_photons(found: CameraFigures, figure: Figure) -> Figure:
+    """Return a figure; without a value where the light is in another unit than photons."""
+    known = _has_photons(found)
+    return figure if known else figure._replace(value=np.nan, told="needs photons")
+
+
+def _light(found: CameraFigures) -> str:
+    """Name of the light, for axes."""
+    return "photons per pixel" if _has_photons(found) else "light in the unit given"
 
 
 def _words_of(found: CameraFigures) -> list[tuple[str, str]]:
@@ -92,9 +130,19 @@ def _words_of(found: CameraFigures) -> list[tuple[str, str]]:
     return [(name, ", ".join(values)) for name, values in words.items()]
 
 
+def rows_of(planes: dict[str, CameraFigures]) -> list[tuple[str, ...]]:
+    """Rows of names, units and the values of all planes."""
+    rows = zip(*map(figures_of, planes.values()), strict=True)
+    return [(each[0].name, each[0].unit, *(figure.number for figure in each)) for each in rows]
+
+
+def _side_by_side(planes: dict[str, CameraFigures]) -> Table:
+    return Table("Planes side by side", ("Figure", "Unit", *planes), rows_of(planes))
+
+
 def camera_parts(name: str, planes: dict[str, CameraFigures]) -> list[Part]:
     """Collect what a page says of a camera: a part for each plane of its colour filters."""
-    largest, last = int(LARGEST / len(planes) ** 0.5), [*planes][-1]
+    largest, (first, *_), last = int(LARGEST / len(planes) ** 0.5), planes, [*planes][-1]
     parts = []
     for plane, found in planes.items():
         maps = _maps(found)
@@ -106,7 +154,7 @@ def camera_parts(name: str, planes: dict[str, CameraFigures]) -> list[Part]:
             figures=_words_of(found),
             maps=[mapped(each, largest) for each in maps],
             plots=[*map(drawn, _curves(found, maps))],
-            tables=[_levels(found)],
+            tables=[*([_side_by_side(planes)] if plane == first and plane else []), _levels(found)],
             provenance=provenance_of(found.metadata) if plane == last else [],
         )
         parts.append(part)
@@ -131,7 +179,8 @@ def _levels(found: CameraFigures) -> Table:
         tuple(f"{each:.5g}" if np.isfinite(each) else "none" for each in row)
         for row in zip(*columns, strict=True)
     ]
-    head = ("Photons", "Exposure, s", "Mean, DN", "Variance, DN²", "Dark, DN", "Its variance, DN²")
+    light = "Photons" if _has_photons(found) else "Light"
+    head = (light, "Exposure, s", "Mean, DN", "Variance, DN²", "Dark, DN", "Its variance, DN²")
     return Table("Levels", (*head, "SNR"), rows, "Variances are temporal, of one frame.")
 
 
@@ -149,9 +198,8 @@ def _curves(found: CameraFigures, maps: list[Map]) -> Iterator[Callable[[Axes], 
     """Functions that draw the curves."""
     for draw in (_draw_responsivity, _draw_transfer, _draw_linearity, _draw_snr):
         yield partial(draw, found=found)
-    if np.isfinite(found.transfer.dark_current_mean):
-        for column in (0, 1):
-            yield partial(_draw_dark, found=found, column=column)
+    for column in (0, 1) if len(np.unique(found.exposure_s)) > 1 else ():
+        yield partial(_draw_dark, found=found, column=column)
     for shown in maps:
         yield partial(draw_spectrum, shown=shown)
         for axis in (0, 1):
@@ -172,10 +220,11 @@ def _draw_line(axes: Axes, x: Floats, y: Floats, slope: float, unit: str) -> Non
 
 def _draw_responsivity(axes: Axes, found: CameraFigures) -> None:
     t = found.transfer
-    _draw_line(axes, found.photons, _signal(found), t.responsivity, "DN/photon")
+    unit = "DN/photon" if _has_photons(found) else "DN over that"
+    _draw_line(axes, found.photons, _signal(found), t.responsivity, unit)
     axes.axhline(TRANSFER * t.saturation_dn, color="gray", **_FINE)
     axes.set(title="Responsivity", ylabel="mean less dark, DN")
-    axes.set_xlabel(f"photons per pixel; line: {TRANSFER:.0%} of saturation, end of the fit")
+    axes.set_xlabel(f"{_light(found)}; line: {TRANSFER:.0%} of saturation, end of the fit")
 
 
 def _draw_transfer(axes: Axes, found: CameraFigures) -> None:
@@ -188,13 +237,15 @@ def _draw_transfer(axes: Axes, found: CameraFigures) -> None:
 
 def _draw_linearity(axes: Axes, found: CameraFigures) -> None:
     """Draw deviations from the line of the linearity error, over the levels that it counts."""
-    (offset, slope), share = found.transfer.line, _signal(found) / found.transfer.saturation_dn
-    counts = (share >= LINEAR[0]) & (share <= LINEAR[1])
+    (offset, slope), counts = (
+        found.transfer.line,
+        linear_levels(_signal(found), found.transfer.saturation_dn),
+    )
     photons, signal = found.photons[counts], _signal(found)[counts]
     deviation = 100 * (signal / (offset + slope * photons) - 1)
     axes.plot(photons, deviation, "o-", markersize=3, **_FINE)
     axes.axhline(0, color="gray", **_FINE)
-    axes.set(title="Deviation from linearity", xlabel="photons per pixel", ylabel="%")
+    axes.set(title="Deviation from linearity", xlabel=_light(found), ylabel="%")
 
 
 def _draw_snr(axes: Axes, found: CameraFigures) -> None:
@@ -206,19 +257,21 @@ def _draw_snr(axes: Axes, found: CameraFigures) -> None:
     if found.spatial is not None:
         total = t.snr(at, found.spatial.dsnu.total, found.spatial.prnu.total)
         axes.loglog(at, total, "--", label="with DSNU and PRNU", **_FINE)
-    axes.loglog(at, np.sqrt(at), ":", color="gray", label="ideal sensor", **_FINE)
+    if _has_photons(found):
+        axes.loglog(at, np.sqrt(at), ":", color="gray", label="ideal sensor", **_FINE)
     axes.axvline(t.threshold_light, color="gray", **_FINE)
     axes.axvline(t.saturation_light, color="gray", **_FINE)
     axes.set(title="Signal-to-noise ratio", ylabel="signal over noise")
-    axes.set_xlabel("photons per pixel; lines: threshold, saturation")
+    axes.set_xlabel(f"{_light(found)}; lines: threshold, saturation")
     axes.legend(fontsize="small")
 
 
 def _draw_dark(axes: Axes, found: CameraFigures, column: int) -> None:
-    """Draw means, or variances, of the darks over the exposure time, with their line."""
-    times, values = found.exposure_s, found.off[:, column]
+    """Draw means, or variances, of the darks over the exposure time, with their line if known."""
+    times, values, t = found.exposure_s, found.off[:, column], found.transfer
     axes.plot(times, values, "o", markersize=3)
-    axes.plot(times, np.polyval(np.polyfit(times, values, 1), times), **_FINE)
+    if np.isfinite((t.dark_current_mean, t.dark_current_variance)[column]):
+        axes.plot(times, np.polyval(np.polyfit(times, values, 1), times), **_FINE)
     name, unit = (("Mean", "DN"), ("Variance", "DN²"))[column]
     axes.set(title=f"{name} of the dark", xlabel="exposure time, s", ylabel=unit)
 
