@@ -13,7 +13,7 @@ import pytest
 
 import equipix
 from equipix import cli, errors, simulate
-from equipix.comparison import _student_quantile
+from equipix.comparison import Check, _student_quantile, _verdict
 from equipix.pictures import draw_comparison
 
 SHAPE = (96, 128)
@@ -172,6 +172,9 @@ def test_bad_arguments_are_named(experiments):
         equipix.compare(calibrations, predicted=np.ones((2, 2)))
     with pytest.raises(errors.InputError, match=r"'predicted' has shape \(3, 1\)"):
         equipix.compare(calibrations, predicted=np.ones((3, 1)))
+    for wrong in (0, -1e-3, np.nan, np.inf):
+        with pytest.raises(errors.InputError, match="'predicted' is .* finite numbers above 0"):
+            equipix.compare(calibrations, predicted=[[1e-3, 1e-4], [1e-3, wrong], [1e-3, 1e-4]])
     shape, shifts = (40, 50), equipix.cross_pattern(5, 7)
     frames = simulate.exposures(np.ones(shape), simulate.gaussian_beam(shape), shifts)
     small = equipix.calibrate(frames, shifts)
@@ -280,9 +283,9 @@ def test_errors_of_one_experiment_are_seen(draws, figure, wrong, what):
     assert seen == len(seeds)
 
 
-def test_the_verdict_has_a_rule(tmp_path):
+def test_the_verdict_has_a_rule(alike, tmp_path):
     """Limits of the rms follow from the degrees of freedom, those of tilts from their law."""
-    pair = [measured(1, 4), measured(2, 5)]
+    pair = alike
     pixels, *tilts, blocks = equipix.compare(pair).checks[0]
     assert [each.what for each in tilts] == ["tilt along rows", "tilt along columns"]
     # Four checks share 1 %: normal for both sides of a tilt; the map is exact to 2 %.
@@ -300,6 +303,42 @@ def test_the_verdict_has_a_rule(tmp_path):
     same = equipix.compare([pair[0], pair[0]])
     assert same.verdicts[0].startswith("agree better than their noise: pixels without tilt")
     assert len(repr(same)) <= 120
+
+
+def test_a_check_passes_within_its_limits_alone():
+    ratios = {0.9: False, 0.95: True, 1.05: True, 1.1: False, np.nan: False, np.inf: False}
+    for ratio, passed in ratios.items():
+        assert Check("it", ratio * 2e-3, 2e-3, 0.95, 1.05).passed is passed
+    agreement = [_verdict((Check("it", ratio, 1, 0.95, 1.05),)) for ratio in ratios]
+    assert [each.startswith("agree within") for each in agreement] == [*ratios.values()]
+
+
+@pytest.fixture(scope="module")
+def alike():
+    """A pair with error bars that agrees."""
+    return [measured(1, 4), measured(2, 5)]
+
+
+def test_errors_of_the_solver_are_no_difference(alike):
+    """Of each the estimate counts once: at the upper limits, in pixels, tilts and blocks."""
+    first, second = alike
+    plain = equipix.compare(alike).checks[0]
+    coarse = dataclasses.replace(first, error_estimate=3e-3)
+    found = equipix.compare([coarse, second]).checks[0]
+    assert len(found) == 4
+    for each, was in zip(found, plain, strict=True):
+        assert each.predicted == pytest.approx(np.hypot(was.predicted, 3e-3), rel=1e-4)
+        assert each.high == pytest.approx(was.high, rel=1e-9)
+        # A solver that left nothing of it is not too good.
+        assert each.low * each.predicted == pytest.approx(was.low * was.predicted, rel=1e-9)
+
+
+def test_maps_without_standard_deviations_are_not_judged(alike):
+    first, second = alike
+    for change in ({"sensitivity_std": 0 * first.sensitivity_std}, {"error_estimate": np.inf}):
+        result = equipix.compare([dataclasses.replace(first, **change), second])
+        assert result.checks == ((),)
+        assert result.verdicts[0].startswith("not judged")
 
 
 @pytest.mark.parametrize(
