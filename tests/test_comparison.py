@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import html
 import json
 import re
@@ -349,6 +350,30 @@ def test_quantiles_are_those_of_tables(freedom, quantile):
     assert _student_quantile(0.995, freedom) == pytest.approx(quantile, rel=2e-5)
 
 
+def check_pairs(files, limits, run):
+    """What --check says of a pair that agrees, of one that differs, and of one without bars."""
+    assert run("compare", *files[:2], "--check")[0] == 0
+    status, _, told = run("compare", *files[:3], "--check")
+    assert status == 1
+    assert re.search(
+        r"tilted\.tif: tilt along columns, over predicted is \d+.*, expected 0 to", told
+    )
+    assert f"{files[0]} − {files[1]}" not in told
+    status, _, told = run("compare", files[0], files[3], "--check")
+    assert status == 1
+    assert "nothing is judged of" in told
+    assert "--uncertainty" in told
+    limits.write_text("[comparison]\nrms = 1e-6\nlargest = 1\n")
+    asked = ("compare", *files[:2], "--limits", limits, "--check")
+    status, printed, told = run(*asked)
+    assert status == 1
+    assert re.search("rms is .*, expected at most 1e-06", told)
+    assert re.search("PASS .*other.tif: largest ", printed)
+    (pair,) = json.loads(run(*asked, "--json")[1])["pairs"]
+    assert [each["passed"] for each in pair["checks"]] == [True] * 3
+    assert [each["verdict"] for each in pair["limits"]][-2:] == ["FAIL", "PASS"]
+
+
 def test_a_page_and_words_have_the_verdict(tmp_path, run):
     files = [tmp_path / f"{name}.tif" for name in ("one", "other", "tilted", "plain")]
     calibrations = [measured(1, 4), measured(2, 5), measured(3, 5, lamp=3e-5)]
@@ -377,6 +402,10 @@ def test_a_page_and_words_have_the_verdict(tmp_path, run):
     assert found["pairs"][0]["verdict"].startswith("not judged: no standard deviations")
     assert found["pairs"][0]["checks"] == []
     assert run("compare", *files[:2], "-o", tmp_path / "page.htm")[0] == 1
+    # The page has the content of its files, and what failed.
+    assert hashlib.sha256(files[2].read_bytes()).hexdigest() in text
+    assert text.count("None: nothing contradicts the result.") == 1
+    check_pairs(files, tmp_path / "limits.toml", run)
     result = equipix.compare(calibrations[:2])
     assert len(result.plot().axes) > 5
     assert "agree within their noise" in result._repr_html_()

@@ -147,8 +147,8 @@ def compare(
       the found one has (Σ 1/λ)²/Σ 1/λ² degrees of freedom. Error bars with a relative standard
       error e (``metadata["uncertainty"]``) have 1/(2e²). Both calibrations are taken to have waves
       and draws in common, which widens the limits.
-    - The tilt along rows and along columns, over `tilt_std` of both, by the normal distribution. Where
-      the drift of a lamp is part of `tilt_std`, by Student's t with its degrees of freedom.
+    - The tilt along rows and along columns, over `tilt_std` of both, by the normal distribution.
+      Where the drift of a lamp is part of `tilt_std`, by Student's t with its degrees of freedom.
     - The rms of block means, upwards, where it is predicted and no drift of a lamp is part of it.
       That of 16 blocks has 16 degrees of freedom; that of `predicted` counts as exact.
 
