@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import html
 import inspect
 import json
@@ -20,7 +21,16 @@ import equipix
 from equipix import detector, hardware, lens, metrics, nuc, plan, simulate
 from equipix.errors import FileError
 from equipix.pictures import new_figure
-from equipix.report.drawing import draw_map
+from equipix.report.drawing import (
+    draw_convergence,
+    draw_histogram,
+    draw_map,
+    draw_profiles,
+    draw_shifts,
+    draw_spectrum,
+    limits_of,
+)
+from equipix.report.figures import summary, words_of
 from equipix.report.limits import (
     CalibrationLimits,
     CameraLimits,
@@ -105,7 +115,7 @@ def test_values_under_the_pointer_are_those_of_the_map(results):
     np.testing.assert_allclose(read, cal.sensitivity[known], atol=0.51 * (high - low) / 65534)
 
 
-@pytest.mark.parametrize(("shape", "step"), [((30, 40), 1), ((30, 41), 2), ((81, 100), 3)])
+@pytest.mark.parametrize(("shape", "step"), [((30, 40), 1), ((30, 41), 2), ((81, 100), 4)])
 def test_maps_are_reduced_to_block_means(shape, step):
     values = np.random.default_rng(0).standard_normal(shape)
     values[4, 5] = np.nan
@@ -147,6 +157,124 @@ def test_large_maps_are_reduced_in_parts(monkeypatch):
 
 def test_maps_without_a_value_are_left_out(results):
     assert all(np.isfinite(each.values).any() for one in results.values() for each in maps_of(one))
+
+
+def test_blocks_of_colour_filters_leave_no_moire():
+    values = np.tile([[1.0, 2.0], [2.0, 5.0]], (45, 60))
+    assert np.ptp(Map("it", "", values).reduced(50)[0]) == 0
+
+
+def test_errors_of_m_count_the_drift_once(results):
+    """Error bars contain the tilt that a drift hides; the solver's estimate is none of them."""
+    cal, shape = results["calibration"], np.array(SHAPE)
+    covariance = np.diag((np.array([3e-3, 4e-3]) / shape) ** 2)
+    drift = dataclasses.replace(
+        cal.drift, size=1e-3, slope_covariance=covariance, tilt_std=np.array([3e-3, 4e-3])
+    )
+    hidden = cal.sensitivity * np.sqrt(drift.variance_map(cal.sensitivity))
+    noise = np.full(SHAPE, 2e-3)
+    drifting = dataclasses.replace(
+        cal,
+        drift=drift,
+        sensitivity_std=np.hypot(noise, hidden),
+        tilt_std=np.array([5e-3, 5e-3]),
+        error_estimate=1.5e-5,
+    )
+    (table,) = (each for each in part_of("it", drifting, NOTHING).tables if "cause" in each.title)
+    assert [row[:2] for row in table.rows] == [
+        ("Noise, of a pixel", "0.002"),
+        ("Noise, of the tilt", "0.004, 0.003"),
+        ("Drift of the lamp", "0.003, 0.004"),
+    ]
+    assert table.caption == (
+        "The estimated error that the solver left, 1.5e-05, is no standard deviation."
+    )
+    plain = dataclasses.replace(cal, drift=None, sensitivity_std=None, tilt_std=None)
+    (table,) = (each for each in part_of("it", plain, NOTHING).tables if "cause" in each.title)
+    assert table.rows == [("Noise", "not computed", "calibrate with --uncertainty")]
+
+
+def test_dead_and_hot_pixels_are_listed_before_those_of_a_mask(results):
+    flags = np.zeros(SHAPE, np.uint32)
+    flags[:12] = equipix.Flag.NO_FLAT_FIELD | equipix.Flag.DO_NOT_USE
+    flags[20, 3] = equipix.Flag.DEAD | equipix.Flag.DO_NOT_USE
+    flags[22, 30] = equipix.Flag.HOT | equipix.Flag.DO_NOT_USE
+    masked = dataclasses.replace(results["calibration"], flags=flags)
+    table = part_of("it", masked, NOTHING).tables[-1]
+    assert table.rows[:3] == [
+        ("20, 3", "do not use, dead"),
+        ("22, 30", "do not use, hot"),
+        ("0, 0", "do not use, no flat field"),
+    ]
+    assert len(table.rows) == 200
+    assert table.caption == "dead 1, hot 1, no flat field 384. 200 of 386 are listed."
+
+
+def test_shifts_and_fluxes_are_listed(results):
+    cal = results["calibration"]
+    table = part_of("it", cal, NOTHING).tables[0]
+    assert table.head == ("Exposure", "Measured (row, col)", "Used (row, col)", "Turned", "Flux")
+    assert [row[0] for row in table.rows] == ["0", "1", "2", "3", "4"]
+    row, col = cal.shifts[1]
+    assert table.rows[1] == ("1", "given", f"{row:.4f}, {col:.4f}", "0°", "1")
+
+
+def test_colours_are_said_of_response_and_beam():
+    shape, shifts = (16, 20), equipix.cross_pattern(3, 5)
+    truth = simulate.filtered(simulate.paper_sensitivity(shape, rng=1), "RGGB")
+    beam = simulate.gaussian_beam(shape, width=60, amplitude=8000)
+    cal = equipix.calibrate(simulate.exposures(truth, beam, shifts), shifts, cfa="RGGB")
+    figures = dict(words_of(summary(cal)))
+    told = figures["mean response of each colour (M has mean 1 within each)"]
+    assert told.startswith(f"R {cal.colour_response['R']:.4g}, G ")
+    assert "Beam L, over the response of each colour" in [each.name for each in maps_of(cal)]
+
+
+def test_ids_of_a_page_are_unique(results):
+    part = part_of("cal", results["calibration"], NOTHING)
+    text = page([part, part], "Two")
+    ids = re.findall(r'\bid="([^"]*)"', text)
+    assert len(ids) == len(set(ids)) > 100
+    used = re.findall(r'(?:href="#|url\(#)([^")]*)', text)
+    assert set(used) <= set(ids)
+    assert "fewer points than on a page of one" in text
+    assert "fewer points than on a page of one" not in page([part], "One")
+
+
+def test_curves_have_names_units_and_signs(results):
+    cal = results["calibration"]
+    figure = new_figure(4, 4)
+    axes = figure.subplots(2, 3).ravel()
+    values = np.add.outer(np.arange(4.0), 10 * np.arange(6.0))
+    draw_profiles(axes[0], Map("It", "DN", values))
+    lines = {line.get_label(): line.get_ydata().tolist() for line in axes[0].lines}
+    assert lines == {
+        "of each row": [25.0, 26.0, 27.0, 28.0],
+        "of each column": [1.5, 11.5, 21.5, 31.5, 41.5, 51.5],
+    }
+    assert axes[0].get_title() == "Medians: It, DN"
+    draw_shifts(axes[1], cal)
+    np.testing.assert_array_equal(axes[1].lines[0].get_xydata(), cal.shifts[:, ::-1])
+    assert [each.get_text() for each in axes[1].texts] == ["0", "1", "2", "3", "4"]
+    assert axes[1].yaxis_inverted()
+    draw_convergence(axes[2], cal)
+    (line,) = axes[2].lines
+    np.testing.assert_array_equal(line.get_xdata(), cal.history["sweep"])
+    np.testing.assert_array_equal(line.get_ydata(), cal.history["error_estimate"])
+    stripes = np.tile([0.0, 2.0], (8, 4))  # of columns: a peak of rows alone, at half a cycle
+    draw_spectrum(axes[3], Map("It", "DN", stripes))
+    along = {line.get_label(): line.get_xydata()[-1].tolist() for line in axes[3].lines}
+    # A wave of amplitude 1 over 8 pixels: |Σ ±1| / √8.
+    assert along["along rows"] == [0.5, pytest.approx(8**0.5)]
+    assert along["along columns"] == [0.5, 0]
+    assert (axes[3].get_xlabel(), axes[3].get_ylabel()) == ("cycles per pixel", "DN")
+    draw_histogram(axes[4], Map("It", "", np.array([[1.0, 2.0, 2.0, np.nan]])))
+    assert axes[4].patches[0].get_data().values.sum() == 3
+    assert axes[4].get_xlabel().startswith("relative;")
+    assert limits_of(Map("it", "", values, "deviation"), np.array([-1.0, 3.0])) == (
+        pytest.approx(-3, rel=1e-2),
+        pytest.approx(3, rel=1e-2),
+    )
 
 
 class TestLimits:

@@ -83,6 +83,8 @@ class Map:
         Blocks at the last row and column may be smaller.
         """
         step = -(-max(self.values.shape) // largest)
+        if step > 1:  # even: means over odd blocks of colour filters would show moiré
+            step += step % 2
         rows = max(step, _AT_ONCE // self.values.shape[1] // step * step)
         parts = [self.values[first : first + rows] for first in range(0, len(self.values), rows)]
         return np.concatenate([_means(part, step) for part in parts]), step * self.cell
@@ -127,7 +129,8 @@ def _of_calibration(calibration: Calibration) -> Iterator[Map]:
         unit = "DN" if calibration.metadata["options"]["weights"] == "equal" else "σ"
         cell = cell_side(calibration.shape, len(calibration.shifts))
         yield Map("Residuals, rms", unit, residuals, "size", cell)
-    yield Map("Beam L", "DN", calibration.beam)
+    over = "" if calibration.cfa is None else ", over the response of each colour"
+    yield Map(f"Beam L{over}", "DN", calibration.beam)
     if calibration.dark is not None:
         yield Map("Dark", "DN", calibration.dark)
 

@@ -347,8 +347,8 @@ def _errors(calibration: Calibration) -> Table:
     if not rows:
         rows.append(("Noise", "not computed", "calibrate with --uncertainty"))
     solver = (
-        f"The solver left an error of {calibration.error_estimate:.2g} at most, by its own "
-        "estimate. It is no standard deviation."
+        f"The estimated error that the solver left, {calibration.error_estimate:.2g}, is no "
+        "standard deviation."
     )
     return Table("Errors of M by cause", ("Cause", "Standard deviation", "Of what"), rows, solver)
 
