@@ -334,6 +334,80 @@ def test_errors_of_the_solver_are_no_difference(alike):
         assert each.low * each.predicted == pytest.approx(was.low * was.predicted, rel=1e-9)
 
 
+def test_a_drift_in_error_bars_widens_the_tilt_alone(alike):
+    """Student's t with its degrees of freedom; block means, which it tilts, are not judged."""
+    first, second = alike
+    tilt = np.array([3e-3, 4e-3])
+    drift = dataclasses.replace(
+        first.drift,
+        size=1e-3,
+        degrees_of_freedom=2,
+        slope_covariance=np.diag((tilt / SMALL) ** 2),
+        tilt_std=tilt,
+    )
+    was = dataclasses.replace(first.drift, size=0.0, tilt_std=np.zeros(2))
+    hidden = first.sensitivity * np.sqrt(drift.variance_map(first.sensitivity))
+    pair = [
+        dataclasses.replace(
+            first,
+            drift=drift,
+            sensitivity_std=np.hypot(first.sensitivity_std, hidden),
+            tilt_std=np.hypot(first.tilt_std, tilt),
+        ),
+        dataclasses.replace(second, drift=None),
+    ]
+    plain, *_ = equipix.compare([dataclasses.replace(first, drift=was), pair[1]]).checks[0]
+    pixels, *tilts = equipix.compare(pair).checks[0]
+    assert [each.what for each in tilts] == ["tilt along rows", "tilt along columns"]
+    for axis, each in enumerate(tilts):
+        assert each.high == pytest.approx(_student_quantile(1 - 0.01 / 3 / 2, 2), rel=1e-9)
+        std = np.sqrt(sum(c.tilt_std[axis] ** 2 + c.error_estimate**2 for c in pair))
+        assert each.predicted == pytest.approx(std, rel=1e-9)
+    # The pixels' part is without it, to the rounding of float32 error bars.
+    assert pixels.predicted == pytest.approx(plain.predicted, rel=1e-3)
+
+
+def test_error_bars_that_are_inexact_or_uneven_widen_the_limits(alike):
+    exactness = alike[0].metadata["uncertainty"]["relative_standard_error"]
+    plain = equipix.compare(alike).checks[0][0]
+    inexact = [
+        dataclasses.replace(
+            each, metadata={**each.metadata, "uncertainty": {"relative_standard_error": 0.1}}
+        )
+        for each in alike
+    ]
+    sigmas = NormalDist().inv_cdf(1 - 0.0025 / 2)
+    high = equipix.compare(inexact).checks[0][0].high
+    assert high == pytest.approx(1 + sigmas * 0.1, rel=0.1)  # of second order: (3 · 0.1)²
+    uneven = []
+    for each in alike:
+        std = each.sensitivity_std.copy()
+        std[:, : SMALL[1] // 8] *= 8
+        uneven.append(dataclasses.replace(each, sensitivity_std=std))
+    found = equipix.compare(uneven).checks[0][0]
+    # An eighth of the pixels has 64 times the variance of the others: few count.
+    shares = np.array([64, *[1] * 7])
+    evenness = shares.mean() ** 2 / np.mean(shares**2)
+    scatters = [np.hypot(exactness, (2 * TRUTH.size * e) ** -0.5) for e in (1, evenness)]
+    ratio = (found.high - 1) / (plain.high - 1)
+    assert ratio == pytest.approx(scatters[1] / scatters[0], rel=0.15)
+
+
+def test_a_pixel_far_out_is_no_tilt(alike):
+    """M at a corner three times as large counts for no slope of ln M."""
+    first, second = alike
+    sensitivity = first.sensitivity.copy()
+    sensitivity[0, 0] *= 3
+    changed = dataclasses.replace(first, sensitivity=sensitivity)
+    for was, now in zip(
+        equipix.compare(alike).checks[0][1:3],
+        equipix.compare([changed, second]).checks[0][1:3],
+        strict=True,
+    ):
+        # A corner's weight is 6/3072, and its noise 8e-4.
+        assert now.found == pytest.approx(was.found, abs=4 * 8e-4 * 6 / 3072)
+
+
 def test_maps_without_standard_deviations_are_not_judged(alike):
     first, second = alike
     for change in ({"sensitivity_std": 0 * first.sensitivity_std}, {"error_estimate": np.inf}):
