@@ -5,7 +5,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -25,6 +25,7 @@ from equipix.io.frames import read_frames
 from equipix.io.paths import find_files, refuse_inputs
 from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.response import Response
+from equipix.report import limits
 from equipix.report.figures import pair_in_words, summary, told, words_of
 
 _Saved = Calibration | FrameStatistics | Polynomial | Response
@@ -115,6 +116,14 @@ def show_table(titles: Iterable[str], rows: Iterable[Iterable[str]]) -> None:
     for title, *cells in rows:
         shown.add_row(title, *(re.sub(_NO_NUMBER, "not determined", cell) for cell in cells))
     console.Console(soft_wrap=True, markup=False).print(shown)
+
+
+def show_limits(judged: Mapping[str, Iterable[limits.Check]]) -> None:
+    """Print figures of results with their limits."""
+    for name, checks in judged.items():
+        for each in checks:
+            words = f"{name}: {each.name} {each.value}, expected {each.wanted}"
+            print(f"{each.verdict:<10}  {words}")  # noqa: T201
 
 
 def check_output(
@@ -222,6 +231,16 @@ def options_of(
 Force = Annotated[bool, typer.Option("--force", help="Replace an existing output.")]
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+
+Limits = Annotated[
+    Path | None,
+    typer.Option(help="Limits of the figures: .toml; equipix init limits writes usual ones."),
+]
+
+Check = Annotated[
+    bool,
+    typer.Option("--check", help="End with status 1 where one fails, or nothing is judged."),
+]
 
 Workers = Annotated[int | None, typer.Option(min=1, help="Threads; all processors unless given.")]
 
