@@ -99,8 +99,12 @@ class CameraFigures(ReadOnly):
     @property
     def is_quantised(self) -> bool:
         """Whether quantisation hides the temporal dark noise."""
-        noise = self.transfer.dark_noise_dn
-        return noise < QUANTISED**0.5 and not (noise < 0 and self._least >= QUANTISED)
+        return self.transfer.dark_noise_dn < QUANTISED**0.5 and not self.contradicts_times
+
+    @property
+    def contradicts_times(self) -> bool:
+        """Whether the dark noise has a negative square, though each dark has a clear noise."""
+        return self.transfer.dark_noise_dn < 0 and self._least >= QUANTISED
 
     @property
     def _share(self) -> float:
@@ -379,7 +383,7 @@ def _on_levels(found: CameraFigures) -> str | None:
         return None
     return (
         f"{count} levels lie between 5 and 95 % of saturation (limit {_LEVELS}), so the linearity "
-        "error says little, and saturation lies somewhere between two levels: add levels, 50 in all"
+        "error is of few, and saturation lies anywhere between two levels: add levels, 50 in all"
     )
 
 
@@ -389,20 +393,20 @@ def _on_frames(found: CameraFigures) -> str | None:
         return None
     lit, dark = found.frames
     return (
-        f"[spatial] has {lit} frames with light and {dark} without (limit {_FRAMES}), whose noise "
-        "DSNU and PRNU are freed of but for its error: give 100 or more of each"
+        f"[spatial] has {lit} frames with light and {dark} without (limit {_FRAMES}), so DSNU "
+        "and PRNU have the error of a large noise that is subtracted: give 100 or more of each"
     )
 
 
 def _on_times(found: CameraFigures) -> str | None:
     """Say that the noise of the darks contradicts their exposure times."""
-    noise = found.transfer.dark_noise_dn
-    if noise >= 0 or found.is_quantised:
+    if not found.contradicts_times:
         return None
+    noise = found.transfer.dark_noise_dn
     return (
         f"the variance of the darks is from {found._least:.3g} DN² on, and over their exposure "
         f"times it falls to {-(noise**2):.3g} DN² at the time 0, which no noise has: dark noise, "
-        "sensitivity threshold and dynamic range are wrong. See that each 'exposure_s' is that of "
+        "sensitivity threshold and dynamic range are not known. See that each 'exposure_s' is that of "
         "its frames, in seconds"
     )
 
@@ -410,15 +414,15 @@ def _on_times(found: CameraFigures) -> str | None:
 def _on_spread(found: CameraFigures) -> str | None:
     """Say that the exposure times differ, but not by enough."""
     times, t = np.unique(found.exposure_s), found.transfer
-    unknown = np.isnan(t.dark_current_mean) or (
-        np.isnan(t.dark_current_variance) and found._least >= QUANTISED
-    )
+    unknown = ["dark current by the mean"] if np.isnan(t.dark_current_mean) else []
+    if np.isnan(t.dark_current_variance) and found._least >= QUANTISED:
+        unknown += ["dark current by the variance", "dark noise at the time 0"]
     if len(times) < 3 or not unknown:
         return None
     return (
-        f"exposure times from {times[0]:.6g} to {times[-1]:.6g} s determine the noise of the darks "
-        "at the time 0, or their current, to no better than half of the noise: what is not known "
-        "is left out, and dark noise is that of the darks as they are. Spread the exposure times"
+        f"exposure times from {times[0]:.6g} to {times[-1]:.6g} s do not determine "
+        f"{', '.join(unknown)}: the error at the time 0 is above half of the noise of a dark. "
+        "Spread the exposure times; without that, dark noise is that of the darks as they are"
     )
 
 

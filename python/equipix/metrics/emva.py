@@ -427,7 +427,7 @@ def transfer_of(
     if np.count_nonzero(linear) < 3 or not (signal[below] > 0).any():
         raise InputError(
             f"'frames': {np.count_nonzero(linear)} levels lie between 5 and 95 % of saturation at "
-            f"{saturation:.6g} DN, expected three or more"
+            f"{saturation:.6g} DN, expected three or more: add levels from dark to above saturation"
         )
     if not np.ptp(levels[linear]) > 0:
         raise InputError(

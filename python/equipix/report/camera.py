@@ -57,7 +57,8 @@ def bounds_of(found: CameraFigures) -> dict[str, str]:
 def figures_of(found: CameraFigures) -> Iterator[Figure]:
     """List all figures, those of the non-uniformity where it was measured."""
     t, of_noise, of_light = found.transfer, "", ""
-    dark_dn, dark_e = t.dark_noise_dn, t.read_noise_e
+    known = np.nan if found.contradicts_times else 1.0
+    dark_dn, dark_e = known * t.dark_noise_dn, known * t.read_noise_e
     if found.is_quantised:
         of_noise = "below"
         dark_dn, dark_e = np.sqrt([QUANTISED, QUANTISED - 1 / 12]) / (1, t.gain_dn_per_e)
@@ -76,13 +77,14 @@ def figures_of(found: CameraFigures) -> Iterator[Figure]:
     yield from _with_logarithms("snr_max", "largest SNR", t.snr_max, of_light)
     name, inverse = "inverse of the largest SNR", 100 / t.snr_max
     yield Figure("inverse_snr_max_percent", name, "%", inverse, "below" if of_light else "")
+    least, least_e = known * t.threshold_light, known * t.threshold_e
     for key, name, photons, electrons, told in (
-        ("threshold", "absolute sensitivity threshold", t.threshold_light, t.threshold_e, of_noise),
+        ("threshold", "absolute sensitivity threshold", least, least_e, of_noise),
         ("saturation", "saturation capacity", t.saturation_light, t.saturation_e, of_light),
     ):
         yield _in_photons(found, Figure(f"{key}_photons", name, "photons", photons, told))
         yield Figure(f"{key}_e", name, "e⁻", electrons, told)
-    yield from _with_logarithms("dynamic_range", "dynamic range", t.dynamic_range, of_range)
+    yield from _with_logarithms("dynamic_range", "dynamic range", known * t.dynamic_range, of_range)
     if found.spatial is not None:
         dsnu, prnu = found.spatial.dsnu, found.spatial.prnu
         yield Figure("dsnu_dn", "DSNU", "DN", dsnu.total * t.gain_dn_per_e)
@@ -221,7 +223,7 @@ def _draw_line(axes: Axes, x: Floats, y: Floats, slope: float, unit: str) -> Non
     axes.plot(x, y, "o", markersize=3, label="measured")
     axes.axline((0, 0), slope=slope, color="C1", label=f"fit: {slope:.5g} {unit}", **_FINE)
     axes.set_ylim(0, 1.1 * y.max())
-    axes.legend(fontsize="small")
+    axes.legend(fontsize="small", loc="upper left")  # above the line, which begins at 0
 
 
 def _draw_responsivity(axes: Axes, found: CameraFigures) -> None:

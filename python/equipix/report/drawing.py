@@ -25,6 +25,12 @@ _SHARES = (0.1, 99.9)
 
 _MOST_BINS = 1024
 
+_MOST_STEPS = 2**16
+"""Values of a map that tell the step between them."""
+
+_ROUNDING = 1e-6
+"""Differences of values, over their range, that are of rounding."""
+
 _ENOUGH = 2**24
 """Pixels of a map whose lines tell medians, quartiles and spectra of all."""
 
@@ -155,7 +161,13 @@ def draw_histogram(axes: Axes, shown: Map) -> None:
     bins = round(2 * np.cbrt(count))
     if spread > 0:
         bins = max(bins, round(min(3 * (high - low) / spread, _MOST_BINS)))
-    counts, edges = np.histogram(shown.values, min(bins, _MOST_BINS), (low, high))
+    # Bins of whole steps between values: others would hold now one value, now two.
+    step = _step(shown.values)
+    width = step * np.ceil((high - low) / min(bins, _MOST_BINS) / step)
+    bins = int(np.floor((high - low + step / 2) / width)) + 1
+    counts, edges = np.histogram(
+        shown.values, bins, (low - step / 2, low - step / 2 + bins * width)
+    )
     axes.stairs(counts, edges, fill=True, alpha=0.6)
     if spread > 0:
         at = np.linspace(low, high, _MOST_BINS)
@@ -168,6 +180,15 @@ def draw_histogram(axes: Axes, shown: Map) -> None:
         yscale="log",
         ylim=(0.5, 2 * counts.max()),
     )
+
+
+def _step(values: Array) -> float:
+    """Smallest difference between distinct values, of a choice of them; tiny if they have none."""
+    known = np.unique(values.flat[:: -(-values.size // _MOST_STEPS)])
+    known = known[np.isfinite(known)]
+    steps = np.diff(known)
+    rounding = max(_ROUNDING * float(np.ptp(known)) if known.size else 0.0, 1e-300)
+    return float(steps[steps > rounding].min(initial=np.inf)) if steps.size else rounding
 
 
 def _some(values: Array, axis: int) -> Array:
