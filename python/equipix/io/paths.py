@@ -114,11 +114,12 @@ def reading(path: Path) -> Iterator[None]:
     logger.addHandler(complaints)
     try:
         yield
-    except FileNotFoundError as error:
-        raise FileError(f"{path}: does not exist") from error
     except Exception as error:
         # Values out of range are a fault of the file; no memory, or no library, is not.
-        if isinstance(error, EquipixError) and not isinstance(error, InputError):
+        is_fault = not isinstance(error, EquipixError) or isinstance(error, InputError)
+        if isinstance(error, FileNotFoundError) or not (is_fault or path.exists()):
+            raise FileError(f"{path}: does not exist") from error
+        if not is_fault:
             raise
         broken = f"incomplete, damaged, or no {path.suffix} file: use a copy, or make it again"
         codecs = f"{error}; pip install 'equipix[codecs]'" if "imagecodecs" in str(error) else ""
