@@ -597,6 +597,24 @@ def test_a_pipe_sees_no_bars(experiment, tmp_path):
     assert b"\x1b" not in done.stdout
 
 
+@pytest.mark.parametrize("arguments", [(), ("--json",), ("--help",)])
+def test_a_pipe_may_be_closed(calibration, arguments):
+    """As `| head` does; what it has not read is no error."""
+    closed, output = os.pipe()
+    os.close(closed)
+    command = command_line("inspect", calibration, *arguments)
+    done = subprocess.run(command, stdout=output, stderr=subprocess.PIPE, check=False)
+    os.close(output)
+    assert (done.returncode, done.stderr) == (1, b"")
+
+
+def test_names_are_no_markup_of_tables(capsys):
+    terminal.show_table(("a[b]", "[/c]"), [("p[red]0[/red]", "[/d] :smile:"), ("x", "inf")])
+    out = capsys.readouterr().out
+    for words in ("a[b]", "[/c]", "p[red]0[/red]", "[/d] :smile:", "not determined"):
+        assert words in out
+
+
 def test_a_terminal_sees_bars(experiment, tmp_path):
     command = command_line(
         "calibrate", experiment, "-o", tmp_path / "cal.tif", "--tolerance", "1e-3"

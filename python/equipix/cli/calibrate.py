@@ -83,9 +83,9 @@ def inspect(
     as_json: terminal.Json = False,
 ) -> None:
     """Show main figures of a result, and draw its maps."""
-    check_picture(output)
     terminal.check_output(output, [file], force=force)
     content = load(file)
+    check_picture(output)
     result = {"file": str(file), **summary(content)}
     if output is not None:
         save_figure(draw_result(content), output, force=force)
@@ -111,11 +111,11 @@ def compare(
 ) -> None:
     """Show how far calibrations of one sensor agree."""
     is_page = output is not None and output.suffix.lower() == ".html"
-    if not is_page:
-        check_picture(output)
     terminal.check_output(output, calibrations, force=force)
     wanted = read_limits(limits).comparison
     loaded = [read_record(file, Calibration) for file in calibrations]
+    if not is_page:
+        check_picture(output)
     _refuse_equal(calibrations, loaded)
     result = compare_calibrations(loaded)
     names = [str(file) for file in calibrations]

@@ -48,9 +48,11 @@ def progress_bars(*, announce: bool = False) -> Iterator[Progress | None]:
     # Imported where bars are drawn: it takes as long as the rest of `equipix --help`.
     from rich import console, progress
 
+    # Names may hold [ and ], which else are markup.
+    stage = progress.TextColumn("{task.description}", markup=False)
     columns = (progress.BarColumn(), progress.MofNCompleteColumn(), progress.TimeElapsedColumn())
     err = console.Console(stderr=True)
-    with progress.Progress("{task.description}", *columns, console=err, transient=True) as bars:
+    with progress.Progress(stage, *columns, console=err, transient=True) as bars:
         stages: dict[str, Any] = {}
 
         def report(done: int, total: int, stage: str) -> None:
@@ -111,11 +113,16 @@ def show_saved(output: Path, result: _Saved, *, force: bool, as_json: bool) -> N
 def show_table(titles: Iterable[str], rows: Iterable[Iterable[str]]) -> None:
     """Print rows of words in columns under titles."""
     from rich import box, console, table
+    from rich.text import Text
 
-    shown = table.Table(*titles, box=box.SIMPLE_HEAD)
+    # Names may hold [ and ], which else are markup.
+    shown = table.Table(box=box.SIMPLE_HEAD)
+    for title in titles:
+        shown.add_column(Text(title))
     for title, *cells in rows:
-        shown.add_row(title, *(re.sub(_NO_NUMBER, "not determined", cell) for cell in cells))
-    console.Console(soft_wrap=True, markup=False).print(shown)
+        words = (re.sub(_NO_NUMBER, "not determined", cell) for cell in cells)
+        shown.add_row(*map(Text, (title, *words)))
+    console.Console(soft_wrap=True).print(shown)
 
 
 def show_limits(judged: Mapping[str, Iterable[limits.Check]]) -> None:

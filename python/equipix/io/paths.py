@@ -119,7 +119,10 @@ def reading(path: Path) -> Iterator[None]:
         if isinstance(error, FileNotFoundError) or not split(path)[0].exists():
             raise FileError(f"{path}: does not exist") from error
         # Values out of range are a fault of the file; no memory, or no library, is not.
-        if isinstance(error, EquipixError) and not isinstance(error, InputError):
+        is_fault = not isinstance(error, EquipixError) or isinstance(error, InputError)
+        if isinstance(error, FileNotFoundError) or not (is_fault or path.exists()):
+            raise FileError(f"{path}: does not exist") from error
+        if not is_fault:
             raise
         broken = f"incomplete, damaged, or no {path.suffix} file: use a copy, or make it again"
         if _is_text(path):
