@@ -363,7 +363,7 @@ def _variance_of_dark(dark: FrameStatistics, noise: NoiseModel) -> Floats:
     of_frame = _between_neighbours(dark.mean) if is_one else noise.scatter(0.0)
     scatter = of_frame / np.maximum(dark.count, 1)
     of_mean = noise.of_mean(int(dark.count.max()))
-    return np.asarray(scatter + of_mean.rounding_apart(0.0, dark.mean))
+    return np.asarray(scatter + of_mean.rounding_apart(0.0, dark.mean, raw=True))
 
 
 def _between_neighbours(frame: Array) -> float:
