@@ -406,8 +406,8 @@ def _on_times(found: CameraFigures) -> str | None:
     return (
         f"the variance of the darks is from {found._least:.3g} DN² on, and over their exposure "
         f"times it falls to {-(noise**2):.3g} DN² at the time 0, which no noise has: dark noise, "
-        "sensitivity threshold and dynamic range are not known. See that each 'exposure_s' is that of "
-        "its frames, in seconds"
+        "sensitivity threshold and dynamic range are not known. See that each 'exposure_s' is that "
+        "of its frames, in seconds"
     )
 
 
