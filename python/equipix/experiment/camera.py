@@ -30,11 +30,12 @@ from equipix.metrics.emva import (
     TRANSFER,
     EmvaSpatial,
     EmvaTransfer,
-    emva_spatial,
     linear_levels,
     mean_and_variance,
+    spatial_of,
     transfer_of,
 )
+from equipix.metrics.frame_noise import moments
 from equipix.metrics.maps import places_of
 
 _DESCRIPTOR = "EMVA1288_Data.txt"
@@ -306,10 +307,11 @@ class CameraExperiment(Described[CameraManifest]):
             transfer = transfer_of(on, off, photons, times, "the light in photons", names)
             if entry is not None:
                 at = "[spatial]"
-                stacks = read(at, entry.frames), read(at, entry.dark)
-                spatial = emva_spatial(*stacks, gain_dn_per_e=transfer.gain_dn_per_e)
-                bright, dark = (each.mean for each in stacks)
-                frames = int(stacks[0].count.min()), int(stacks[1].count.min())
+                # One after the other: variances of all pixels take as much memory as the means.
+                lit = moments("frames", read(at, entry.frames))
+                unlit = moments("dark", read(at, entry.dark))
+                spatial = spatial_of(lit, unlit, transfer.gain_dn_per_e)
+                bright, dark, frames = lit.mean, unlit.mean, (lit.frames, unlit.frames)
         except InputError as error:
             raise FileError(f"{self.path}, {at}: {error}") from error
         found = CameraFigures(transfer, spatial, photons, times, on, off, bright, dark, frames)
@@ -405,9 +407,9 @@ def _on_times(found: CameraFigures) -> str | None:
     noise = found.transfer.dark_noise_dn
     return (
         f"the variance of the darks is from {found._least:.3g} DN² on, and over their exposure "
-        f"times it falls to {-(noise**2):.3g} DN² at the time 0, which no noise has: dark noise, "
-        "sensitivity threshold and dynamic range are not known. See that each 'exposure_s' is that "
-        "of its frames, in seconds"
+        f"times it falls to {-(noise**2):.3g} DN² at the time 0, which no noise has, so dark "
+        "noise, sensitivity threshold and dynamic range are left out: see that each 'exposure_s' "
+        "is that of its frames, in seconds"
     )
 
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from equipix._check import (
+    Array,
     ArrayLike,
     Bools,
     Floats,
@@ -23,8 +24,14 @@ from equipix.measured.statistics import FrameStatistics
 from equipix.metrics.frame_noise import Moments, moments, signed_root
 from equipix.shown import Brief
 
-_BOXES = (7, 11)
-"""Widths of the running means of the high-pass."""
+_BOXES = (7, 11, 2, 2)
+"""Widths of the running means of the high-pass: two over 2 are binomial weights over 3."""
+
+_REACH = sum(width - 1 for width in _BOXES) // 2
+"""Pixels on each side that a high-passed one depends on."""
+
+_AT_ONCE = 2**18
+"""Pixels that are high-passed at once: they stay in the cache of a processor."""
 
 
 class Split(NamedTuple):
@@ -132,7 +139,14 @@ def emva_spatial(
     >>> round(found.prnu.total, 3)
     0.01
     """
+    if gain_dn_per_e is not None and not number("gain_dn_per_e", gain_dn_per_e) > 0:
+        raise InputError(f"'gain_dn_per_e' is {gain_dn_per_e!r}, expected a number above 0")
     off, on = moments("dark", dark), moments("frames", frames)
+    return spatial_of(on, off, gain_dn_per_e or 1.0, highpass=highpass)
+
+
+def spatial_of(on: Moments, off: Moments, gain: float, *, highpass: bool = True) -> EmvaSpatial:
+    """Evaluate moments with light and without; see `emva_spatial`."""
     rows, cols = off.mean.shape
     if off.mean.shape != on.mean.shape or rows * cols <= rows + cols:
         raise InputError(
@@ -146,12 +160,12 @@ def emva_spatial(
             f"'frames' have the mean {bright_mean:.6g} DN, 'dark' {dark_mean:.6g}: expected more "
             "light"
         )
-    if gain_dn_per_e is not None and not number("gain_dn_per_e", gain_dn_per_e) > 0:
-        raise InputError(f"'gain_dn_per_e' is {gain_dn_per_e!r}, expected a number above 0")
-    dsnu = _roots(split_variances(off) / (gain_dn_per_e or 1.0) ** 2)
-    if highpass:
-        off, on = (each._replace(mean=high_passed(each.mean)) for each in (off, on))
-    prnu = _roots((split_variances(on) - split_variances(off)) / signal**2)
+    dsnu = _roots(split_variances(off) / gain**2)
+    lit, unlit = (
+        split_variances(each._replace(mean=high_passed(each.mean)) if highpass else each)
+        for each in (on, off)
+    )
+    prnu = _roots((lit - unlit) / signal**2)
     return EmvaSpatial(dsnu, prnu, dark_mean, bright_mean)
 
 
@@ -169,22 +183,35 @@ def split_variances(found: Moments) -> Floats:
     return np.array([s, row, column, pixel])
 
 
-def high_passed(image: Floats) -> Floats:
-    """Return an image less its running means over 7×7, 11×11 and 3×3 binomial weights."""
-    low = image
-    for width in _BOXES:
-        low = _along_both(low, np.full(width, 1 / width))
-    return image - _along_both(low, np.array([0.25, 0.5, 0.25]))
+def high_passed(image: Array) -> Array:
+    """Return an image less its running means over 7×7, 11×11 and 3×3 binomial weights.
+
+    Borders are reflected, edge values doubled. Floating point keeps its precision.
+    """
+    found = np.empty(image.shape, np.result_type(image, np.float32))
+    size, columns = image.shape[0], (_REACH, _REACH)
+    band = max(4 * _REACH, _AT_ONCE // image.shape[1])
+    for first in range(0, size, band):
+        last = min(first + band, size)
+        rows = np.arange(first - _REACH, last + _REACH) % (2 * size)
+        part = image[np.minimum(rows, 2 * size - 1 - rows)].astype(np.float64)
+        low = np.pad(part, ((0, 0), columns), mode="symmetric")
+        for width in _BOXES:
+            for axis in (0, 1):
+                low = _running_mean(low, width, axis)
+        found[first:last] = image[first:last] - low
+    return found
 
 
-def _along_both(image: Floats, weights: Floats) -> Floats:
-    """Weighted running mean along rows and columns; borders are reflected, edge values doubled."""
-    half = len(weights) // 2
-    for _ in ("rows", "columns"):
-        padded = np.pad(image, ((half, half), (0, 0)), mode="symmetric")
-        parts = (weight * padded[k : k + len(image)] for k, weight in enumerate(weights))
-        image = np.asarray(sum(parts)).T
-    return image
+def _running_mean(image: Floats, width: int, axis: int) -> Floats:
+    """Means over `width` rows (axis 0) or columns, of whole windows only."""
+    ends = image.shape[axis] - width + 1
+    parts = [image[k : k + ends] if axis == 0 else image[:, k : k + ends] for k in range(width)]
+    total = parts[0] + parts[1]
+    for part in parts[2:]:
+        total += part
+    total /= width
+    return total
 
 
 def _roots(variances: Floats) -> Split:

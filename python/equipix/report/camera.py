@@ -173,10 +173,14 @@ def _maps(found: CameraFigures) -> list[Map]:
     """Deviations of pixels from the mean: of the dark signal, and of the response to light."""
     if found.bright is None or found.dark is None:
         return []
-    light = found.bright - found.dark
+    # float32 suffices for pictures, and these maps are as large as the sensor.
+    dark = np.subtract(found.dark, found.dark.mean(), dtype=np.float32)
+    response = np.subtract(found.bright, found.dark, dtype=np.float32)
+    response *= np.float32(100 / response.mean(dtype=np.float64))
+    response -= 100
     return [
-        Map("Dark signal", "DN", found.dark - found.dark.mean(), "deviation"),
-        Map("Photo response", "%", 100 * (light / light.mean() - 1), "deviation"),
+        Map("Dark signal", "DN", dark, "deviation"),
+        Map("Photo response", "%", response, "deviation"),
     ]
 
 
@@ -213,8 +217,7 @@ def _curves(found: CameraFigures, maps: list[Map]) -> Iterator[Callable[[Axes], 
         for axis in (0, 1):
             yield partial(_draw_profiles, shown=shown, axis=axis)
         if shown.unit == "%":  # light that changes slowly over the sensor hides single pixels
-            passed = high_passed(shown.values.astype(np.float64))
-            shown = Map(f"{shown.name}, high-passed", "%", passed)
+            shown = Map(f"{shown.name}, high-passed", "%", high_passed(shown.values))
         yield partial(draw_histogram, shown=shown)
 
 
