@@ -9,8 +9,8 @@ from astropy.io import fits
 
 import equipix
 from equipix import Experiment, LevelExperiment, errors, metrics, simulate
-from equipix.experiment.darks import mixed
 from equipix.io.frames import Settings, settings
+from equipix.measured.darks import mixed
 from equipix.measured.means import Averaged
 from given import write_dng
 

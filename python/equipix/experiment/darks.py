@@ -9,16 +9,10 @@ import numpy as np
 from equipix._check import Array, Bools, union
 from equipix.errors import FileError
 from equipix.experiment.manifest import LevelManifest, Manifest, Taken, entry_files, name_of_dark
-from equipix.io.frames import Settings, settings
+from equipix.io.frames import Settings
+from equipix.measured.darks import KEYS, Shares, common_settings, mixed, shares_of
 from equipix.measured.defects import hot_pixels
 from equipix.measured.statistics import FrameStatistics
-
-_SAME = 0.01
-"""Relative difference of exposure times that are the same: EXIF and people round them."""
-
-_KEYS = (("exposure_s", "s"), ("temperature_c", "°C"))
-
-_Shares = tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -36,7 +30,7 @@ class Darks:
     """
 
     frames: tuple[FrameStatistics, ...] = ()
-    shares: Sequence[_Shares] = ()
+    shares: Sequence[Shares] = ()
     black: Array | None = None
 
     def of(self, exposure: int) -> FrameStatistics | Array | None:
@@ -57,31 +51,7 @@ class Darks:
         return union(*(hot_pixels(each, None) for each in self.frames))
 
 
-def mixed(darks: Sequence[FrameStatistics], shares: _Shares) -> FrameStatistics:
-    """Interpolate between dark frames: D = Σ s D_k, with the variance Σ s² var(D_k).
-
-    The variance of one frame is interpolated too, since that of dark current grows with time.
-    """
-    used = [(share, dark) for share, dark in zip(shares, darks, strict=True) if share]
-    (share, one), *others = used
-    if not others:
-        return one
-    ((rest, other),) = others
-    with np.errstate(divide="ignore"):
-        count = 1 / (share**2 / one.count + rest**2 / other.count)
-    return FrameStatistics(
-        share * one.mean + rest * other.mean,
-        share * one.variance + rest * other.variance,
-        share**2 * one.variance_of_mean + rest**2 * other.variance_of_mean,
-        np.where(count > 0, np.maximum(count, 1), 0).astype(np.uint32),
-        one.saturated + other.saturated,
-        saturation=one.saturation,
-        raw=one.raw and other.raw,
-        step=max(one.step, other.step),
-    )
-
-
-def chosen(path: Path, manifest: Manifest | LevelManifest) -> list[_Shares]:
+def chosen(path: Path, manifest: Manifest | LevelManifest) -> list[Shares]:
     """Share of each dark of the manifest `path` in that of each exposure or level.
 
     A single one without exposure time and temperature is that of all.
@@ -100,38 +70,20 @@ def chosen(path: Path, manifest: Manifest | LevelManifest) -> list[_Shares]:
 
     def known(place: str, taken: Taken) -> Settings:
         files = entry_files(path, taken.frames, manifest.layout)
-        return _settings_of(place, taken.settings, files, tolerance)
+        return common_settings(place, taken.settings, files, tolerance)
 
     try:
         darks = [known(name_of_dark(k, len(entries)), each) for k, each in enumerate(entries)]
         _check_darks(darks, stated)
         places = [(f"{kind} '{name}'", taken) for name, taken in measurements]
-        return [_shares_of(place, known(place, each), darks, tolerance) for place, each in places]
+        return [shares_of(place, known(place, each), darks, tolerance) for place, each in places]
     except FileError as error:
         raise FileError(f"{path}: {error}") from error
 
 
-def _settings_of(place: str, stated: Settings, files: Sequence[Path], tolerance: float) -> Settings:
-    """Exposure time and temperature of an entry: as stated in the manifest, else by its files."""
-    read, found = {file: settings(file) for file in files}, list(stated)
-    for index, (key, unit) in enumerate(_KEYS):
-        known = [(file, value) for file, each in read.items() if (value := each[index]) is not None]
-        whence = f"'{key}' of {place}"
-        if stated[index] is None and known:
-            whence = f"the mean of {place}"
-            found[index] = float(np.mean([value for _, value in known]))
-        for file, value in known:
-            if _apart(index, found[index], value, tolerance):
-                raise FileError(
-                    f"'{file.name}' holds {value:g} {unit}, but {whence} is {found[index]:g} "
-                    f"{unit}: correct '{key}', or the files of {place}"
-                )
-    return Settings(*found)
-
-
 def _check_darks(darks: Sequence[Settings], stated: Sequence[Settings]) -> None:
     """Refuse darks without a value that others have, or the manifest gives, and two alike."""
-    for index, (key, _) in enumerate(_KEYS):
+    for index, (key, _) in enumerate(KEYS):
         unknown = [k for k, each in enumerate(darks) if each[index] is None]
         if unknown and any(each[index] is not None for each in (*darks, *stated)):
             place = name_of_dark(unknown[0], len(darks))
@@ -142,54 +94,3 @@ def _check_darks(darks: Sequence[Settings], stated: Sequence[Settings]) -> None:
                 f"[[dark]] {darks.index(each) + 1} and {k + 1} do not differ: write 'exposure_s' "
                 "or 'temperature_c', or name their frames in one"
             )
-
-
-def _shares_of(
-    place: str, wanted: Settings, darks: Sequence[Settings], tolerance: float
-) -> _Shares:
-    """Share of each dark in that of an exposure: the one that fits, or two beside it in time."""
-    held = [
-        f"{', '.join(f'{each:g}' for each in dict.fromkeys(values) if each is not None)} {unit}"
-        for values, (_, unit) in zip(zip(*darks, strict=True), _KEYS, strict=True)
-    ]
-    for index, (key, _) in enumerate(_KEYS):
-        differ = any(_apart(index, each[index], darks[0][index], tolerance) for each in darks)
-        if wanted[index] is None and differ:
-            raise FileError(
-                f"'{key}' of {place} is not known, and the [[dark]] have {held[index]}: write it"
-            )
-    near = [k for k, each in enumerate(darks) if not _apart(1, wanted[1], each[1], tolerance)]
-    if not near:
-        raise FileError(
-            f"no dark fits {place} of {wanted.temperature_c:g} °C within {tolerance:g} K: they "
-            f"have {held[1]}. Take dark frames at its temperature, or raise "
-            "'dark_temperature_tolerance_c' in [sensor]"
-        )
-
-    def distance(k: int) -> list[float]:
-        """How far a dark is, in time and then in temperature; 0 where it is not known."""
-        pairs = zip(wanted, darks[k], strict=True)
-        return [0.0 if a is None or b is None else abs(a - b) for a, b in pairs]
-
-    best = min(near, key=distance)
-    if not _apart(0, wanted[0], darks[best][0], tolerance):
-        return tuple(float(k == best) for k in range(len(darks)))
-    time, times = wanted.exposure_s or 0.0, [each.exposure_s or 0.0 for each in darks]
-    below, above = ([k for k in near if (times[k] > time) is later] for later in (False, True))
-    if not (below and above):
-        raise FileError(
-            f"no dark fits {place} of {time:g} s: those of its temperature have "
-            f"{', '.join(f'{times[k]:g}' for k in near)} s, and a dark is interpolated between two "
-            "times, not extrapolated: take dark frames of this time"
-        )
-    low, high = min(below, key=distance), min(above, key=distance)
-    share = (times[high] - time) / (times[high] - times[low])
-    return tuple(share * (k == low) + (1 - share) * (k == high) for k in range(len(darks)))
-
-
-def _apart(index: int, one: float | None, other: float | None, tolerance: float) -> bool:
-    """Whether two exposure times, or temperatures, are known and differ."""
-    if one is None or other is None:
-        return False
-    limit = tolerance if index else _SAME * max(one, other)
-    return abs(one - other) > limit + 1e-9 * abs(one)
