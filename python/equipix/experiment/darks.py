@@ -10,9 +10,25 @@ from equipix._check import Array, Bools, union
 from equipix.errors import FileError
 from equipix.experiment.manifest import LevelManifest, Manifest, Taken, entry_files, name_of_dark
 from equipix.io.frames import Settings
-from equipix.measured.darks import KEYS, Shares, common_settings, mixed, shares_of
+from equipix.measured.darks import (
+    Shares,
+    Wording,
+    check_darks,
+    common_settings,
+    mixed,
+    shares_of,
+)
 from equipix.measured.defects import hot_pixels
 from equipix.measured.statistics import FrameStatistics
+
+_WORDS = Wording(
+    darks="the [[dark]]",
+    values=("'exposure_s'", "'temperature_c'"),
+    unknown="write it",
+    contradiction="correct {name}, or the files of {place}",
+    alike="write 'exposure_s' or 'temperature_c', or name their frames in one",
+    temperature=", or raise 'dark_temperature_tolerance_c' in [sensor]",
+)
 
 
 @dataclass(frozen=True)
@@ -70,27 +86,15 @@ def chosen(path: Path, manifest: Manifest | LevelManifest) -> list[Shares]:
 
     def known(place: str, taken: Taken) -> Settings:
         files = entry_files(path, taken.frames, manifest.layout)
-        return common_settings(place, taken.settings, files, tolerance)
+        return common_settings(place, taken.settings, files, tolerance, _WORDS)
 
     try:
-        darks = [known(name_of_dark(k, len(entries)), each) for k, each in enumerate(entries)]
-        _check_darks(darks, stated)
+        names = [name_of_dark(k, len(entries)) for k in range(len(entries))]
+        darks = list(map(known, names, entries))
+        check_darks(names, darks, stated, _WORDS)
         places = [(f"{kind} '{name}'", taken) for name, taken in measurements]
-        return [shares_of(place, known(place, each), darks, tolerance) for place, each in places]
+        return [
+            shares_of(place, known(place, each), darks, tolerance, _WORDS) for place, each in places
+        ]
     except FileError as error:
         raise FileError(f"{path}: {error}") from error
-
-
-def _check_darks(darks: Sequence[Settings], stated: Sequence[Settings]) -> None:
-    """Refuse darks without a value that others have, or the manifest gives, and two alike."""
-    for index, (key, _) in enumerate(KEYS):
-        unknown = [k for k, each in enumerate(darks) if each[index] is None]
-        if unknown and any(each[index] is not None for each in (*darks, *stated)):
-            place = name_of_dark(unknown[0], len(darks))
-            raise FileError(f"'{key}' of {place} is not known: write it")
-    for k, each in enumerate(darks):
-        if each in darks[:k]:
-            raise FileError(
-                f"[[dark]] {darks.index(each) + 1} and {k + 1} do not differ: write 'exposure_s' "
-                "or 'temperature_c', or name their frames in one"
-            )

@@ -210,7 +210,7 @@ class Experiment(Described[Manifest]):
             start = first.fit
         origin = self._provenance(
             hashes,
-            averaged.noise,
+            averaged,
             exposures=[exposure.name for exposure in self.manifest.exposure],
             measured_shifts=shifts.tolist(),
             measured_shift_std=std.tolist(),
