@@ -160,6 +160,14 @@ def settings(path: Path) -> Settings:
         return Settings(tiff.exposure_s(path) if suffix in (".tif", ".tiff") else None)
 
 
+def image_type(path: Path) -> str:
+    """What an image shows by the header of a FITS file, such as "Dark Frame"; else empty."""
+    if suffix_of(path) not in fits.READ:
+        return ""
+    with reading(path):
+        return fits.image_type(path)
+
+
 class Header(NamedTuple):
     """Shape (n, rows, cols) and dtype of the frames of a file, and the text stored with them."""
 
