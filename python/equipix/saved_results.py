@@ -27,7 +27,11 @@ READ = ".tif, .npz, .fits, .nxs, .asdf, .bin, .hex or .h"
 """What is read, in words: of each format one suffix."""
 
 _NO_CORRECTIONS = (
-    (DynamicCorrection, "a dynamic correction", "save its correction(...) of a state"),
+    (
+        DynamicCorrection,
+        "a dynamic correction",
+        "save its correction(...) of a state, or give the state to equipix correct (--substrate-c)",
+    ),
     (FrameStatistics, "frame statistics", "equipix correct subtracts them as --dark"),
     (SceneCorrection, "the state of a scene correction", "save its correction(), equipix scene -o"),
 )
@@ -66,12 +70,28 @@ def load(path: str | PathLike[str]) -> Any:
     return resumed(path, found) if isinstance(found, SceneState) else found
 
 
-def load_correction(path: str | PathLike[str]) -> Correction:
+def load_correction(
+    path: str | PathLike[str], *, substrate_c: float | None = None, bias_v: float | None = None
+) -> Correction:
     """Read a correction, and refuse results that are none.
 
-    The parameters and errors are those of `load`.
+    The parameters and errors are those of `load`, and of a state those of
+    `DynamicCorrection.correction`; the bias must be given where several were calibrated.
     """
     found = load(path)
+    state = {"substrate_c": substrate_c, "bias_v": bias_v}
+    given = {name: value for name, value in state.items() if value is not None}
+    if given and isinstance(found, DynamicCorrection):
+        low, high = found.axes.bias_v
+        for name in state if low < high else ["substrate_c"]:
+            if name not in given:
+                raise InputError(f"'{name}' is missing, but {path} follows it: give its value")
+        return found.correction(given["substrate_c"], bias_v)
+    if given:
+        raise InputError(
+            f"'{next(iter(given))}' is given, but {path} follows neither temperature nor bias: "
+            "leave it out"
+        )
     for kind, held, words in _NO_CORRECTIONS:
         if isinstance(found, kind):
             raise FileError(f"{path}: holds {held}, expected a correction: {words}")

@@ -311,7 +311,7 @@ class TestFiles:
     def test_another_dark_is_refused_where_there_is_none(self, bent, images, tmp_path, dark):
         before = sorted(tmp_path.iterdir())
         with pytest.raises(InputError, match=f"'dark' is '{dark}', but the offsets .* 'stored'"):
-            correct_files(bent, images[1], tmp_path / "out.tif", dark=dark)
+            correct_files(bent, images[1], tmp_path / "out.tif", dark=[dark])
         assert sorted(tmp_path.iterdir()) == before
 
 

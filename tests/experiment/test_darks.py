@@ -9,8 +9,8 @@ from astropy.io import fits
 
 import equipix
 from equipix import Experiment, LevelExperiment, errors, metrics, simulate
-from equipix.experiment.darks import mixed
 from equipix.io.frames import Settings, settings
+from equipix.measured.darks import mixed, settings_in, settings_of
 from equipix.measured.means import Averaged
 from given import write_dng
 
@@ -226,7 +226,7 @@ def test_what_exposures_have_in_common_of_their_darks(shares, common, own):
         ),
         (r"'exposure_s' of \[\[dark\]\] 1 is not known: write it", [("exposure_s = 0.5\n", "")]),
         (
-            r"\[\[dark\]\] 1 and 2 do not differ: write 'exposure_s' or 'temperature_c'",
+            r"\[\[dark\]\] 1 and \[\[dark\]\] 2 do not differ: write 'exposure_s' or",
             [("exposure_s = 0.5\n", "exposure_s = 1.0\n")],
         ),
         (
@@ -314,6 +314,19 @@ def test_headers_of_fits_files_give_what_the_manifest_leaves_out(tmp_path, camer
     # Light without dark is proportional to the exposure time, so lines hold.
     # One degree of freedom in each of 5120 pixels: 2 %, and a model of the noise from 8 frames.
     assert np.nanmean(response.reduced_chi2) == pytest.approx(1, abs=0.1)
+
+
+def test_averages_and_results_keep_what_their_darks_were_taken_with(tmp_path, camera):
+    path = fits_levels(tmp_path, camera, dark_times=(1.0,))
+    average = equipix.average(tmp_path / "dark1.fits", saturation=65535)
+    average.save(tmp_path / "master.tif")
+    assert settings_of(tmp_path / "master.tif") == Settings(1.0, -9.95)
+    assert settings_in(mixed([average] * 2, (0.5, 0.5)).metadata) == Settings(1.0, -9.95)
+    several = equipix.average([tmp_path / f"level{k}.fits" for k in (1, 2)])
+    assert settings_in(several.metadata) == Settings()
+    path.write_text(path.read_text().replace("dark1.fits", "master.tif"))
+    known = LevelExperiment.load(path).run(order=0).metadata["dark_settings"]
+    assert known == {"exposure_s": 1.0, "temperature_c": -9.95}
 
 
 @pytest.mark.parametrize(

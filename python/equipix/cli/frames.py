@@ -9,13 +9,13 @@ import typer
 from equipix.cli import terminal
 from equipix.correction.correct_files import correct_files, is_folder
 from equipix.errors import InputError
-from equipix.experiment.darks import average_findings
 from equipix.experiment.image_files import origin_of, refuse_repeated_files, with_inputs
 from equipix.findings import ask, say
 from equipix.io.formats import SUFFIXES
 from equipix.io.paths import find_files, refuse_inputs
 from equipix.measured import statistics
 from equipix.measured.average import average as average_frames
+from equipix.measured.darks import average_findings
 from equipix.report.figures import known
 from equipix.saved_results import READ, load_correction
 
@@ -68,7 +68,9 @@ def averaged(
 @commands.command(epilog="Example: equipix correct cal.tif raw/*.tif -o corrected/")
 @terminal.options_of(
     correct_files,
-    dark="'stored', 'none', or a file: dark frames or their average.",
+    dark="'stored', which it is unless given, 'none', or dark frames or their average, a pattern "
+    "in quotes: --dark 'd*.fits'. Given once for each exposure time, each frame takes the one that "
+    "fits by its header, or one interpolated between two.",
     flagged="What flagged pixels become. Unless given, NaN in floating-point numbers; in whole "
     "numbers and pictures the mean of good neighbours.",
     dtype="Type of the result: whole numbers are rounded half to even, and values that had to be "
@@ -83,9 +85,19 @@ def correct(
     output: Annotated[
         Path,
         typer.Option(
-            "--output", "-o", help="A .tif of all frames, a .png of one, or a folder of files."
+            "--output",
+            "-o",
+            help="A .tif or .fits of all frames, a .png of one, or a folder: of FITS files .fits "
+            "with their headers, of others .tif.",
         ),
     ],
+    substrate_c: Annotated[
+        float | None,
+        typer.Option(help="Temperature of the substrate in °C, for a correction that follows it."),
+    ] = None,
+    bias_v: Annotated[
+        float | None, typer.Option(help="Bias in volts, for a correction that follows it.")
+    ] = None,
     sensor: terminal.Sensor = None,
     workers: terminal.Workers = None,
     force: terminal.Force = False,
@@ -95,14 +107,16 @@ def correct(
     """Correct frames by a calibration or by response curves."""
     _refuse_image(output)
     terminal.check_output(output, [correction], force=force, folder=is_folder(output))
+    applied = load_correction(correction, substrate_c=substrate_c, bias_v=bias_v)
+    state = ", ".join(f"{name} {x:g}" for name, x in applied.metadata.get("state", {}).items())
     with terminal.working() as (progress, _):
         done = correct_files(
-            load_correction(correction),
+            applied,
             frames,
             output,
             sensor=sensor,
             workers=workers,
-            origin=origin_of(correction),
+            origin=", ".join(filter(None, (origin_of(correction), state))),
             force=force,
             progress=progress,
             **options,
@@ -111,8 +125,9 @@ def correct(
     counts = known(
         limited_values=done.limited if whole else None,
         extrapolated_values=done.extrapolated,
-        replaced_pixels=done.replaced or None,
-        unusable_pixels=done.flagged or None,
+        replaced_pixels=done.replaced,
+        unusable_pixels=done.flagged,
+        unit="DN" if options["display"] is None else None,
     )
     result = {"output": str(output), "frames": done.frames, "dtype": done.dtype, **counts}
     terminal.show_result(result, done.findings, as_json=as_json)
@@ -122,6 +137,7 @@ def _refuse_image(output: Path) -> None:
     """Refuse a new folder that is named like a file of another format."""
     if output.suffix and is_folder(output) and not output.is_dir():
         raise InputError(
-            f"'{output}' ends in '{output.suffix}', but corrected frames are written as .tif: name "
-            "a .tif, a .png of one frame, or a folder (one with a dot in its name: make it first)"
+            f"'{output}' ends in '{output.suffix}', but corrected frames are written as .tif or "
+            ".fits: name one for all frames, a .png of one, or a folder (with a dot in its name: "
+            "make it first)"
         )

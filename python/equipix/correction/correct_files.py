@@ -1,6 +1,7 @@
 """Frames in files corrected, and pictures of them."""
 
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,16 +10,22 @@ from numpy.typing import NDArray
 
 from equipix._check import LOG, Array, Display, Flagged, OutputType, Progress
 from equipix.correction.apply import FAST, Corrector, output_dtype, usual_treatment
-from equipix.correction.protocol import Correction, Dark, refuse_dark
+from equipix.correction.darks import (
+    FileDarks,
+    file_darks,
+    is_as_dark,
+    warn_of_as_dark,
+    warn_of_darker,
+)
+from equipix.correction.protocol import Correction, Dark
 from equipix.errors import FileError, InputError
 from equipix.findings import Finding, Findings, say, usable
+from equipix.io import fits
 from equipix.io.formats import raw_headers
-from equipix.io.frames import Header, stream_frames
+from equipix.io.frames import Header, stream_frames, suffix_of
 from equipix.io.paths import find_files, folder_beside, refuse_inputs, write_whole
 from equipix.io.png import write_png
 from equipix.io.tiff import write_frames
-from equipix.measured.average import average
-from equipix.measured.statistics import DARKER, FrameStatistics, refuse_subtracted
 
 _MARK = "corrected by equipix"
 """Beginning of the description of what `correct_files` writes, so that a second correction is
@@ -61,7 +68,7 @@ def correct_files(
     source: list[str],
     output: Path,
     *,
-    dark: str = "stored",
+    dark: list[str] | None = None,
     flagged: Flagged | None = None,
     dtype: OutputType | None = None,
     bit_depth: int | None = None,
@@ -81,11 +88,14 @@ def correct_files(
     source : list of str
         Image files or globs.
     output : Path
-        A name that ends in .tif: one file of all frames; in .png: the only frame, as whole numbers.
-        Another: a folder to make, with a TIFF for each input file.
-    dark : str
-        "stored", "none", a file or glob of dark frames, or one of their saved statistics. Only a
-        correction that subtracts a dark frame takes another than "stored".
+        A name that ends in .tif or .fits: one file of all frames; in .png: the only frame, as whole
+        numbers. Another: a folder to make, with a FITS file for each FITS file, pictures apart, and
+        a TIFF for each other. FITS files keep the headers of FITS files.
+    dark : list of str, optional
+        "stored", which it is unless given, "none", or for each exposure time a file or glob of dark
+        frames, or of their saved statistics. Of several each file takes the one that fits by its
+        header, or one interpolated between two exposure times. Only a correction that subtracts a
+        dark frame takes another than "stored".
     flagged : {"nan", "keep", "replace"}, optional
         What becomes of flagged pixels. Unless given, they become NaN in floating-point numbers, and
         are replaced in whole numbers and pictures.
@@ -115,7 +125,8 @@ def correct_files(
     ------
     FileError
         If a file cannot be read or written, an input is named twice, two outputs would have the
-        same name, or one would replace an input.
+        same name, or one would replace an input; if a dark is of several exposure times or holds
+        light by its header, or none of several darks fits a file.
     InputError
         If the frames have another shape than the correction, it takes no other dark frame, or more
         than one frame would go to a .png, or floating-point numbers.
@@ -127,60 +138,117 @@ def correct_files(
     InputWarning
         If the first frame is darker than the dark by more than a quarter of the dark.
     InputWarning
+        If frames are of another exposure time or temperature than their dark, or dark frames.
+    InputWarning
         If most values had to be limited to the range of whole numbers.
     """
     wanted = _dtype(output, dtype, bit_depth, display)
     files = find_files(source)
     refuse_inputs(files, [], "is named twice: name each input once")
-    outputs = _outputs(output, files)
+    outputs = _outputs(output, files, display)
     refuse_inputs(outputs, files)
     headers = raw_headers(files, correction.shape)
     total, done = sum(header.shape[0] for header in headers.values()), 0
     _refuse_pictures(output, total, wanted)
     said = warn_of_corrected(headers, origin)
     flagged = usual_treatment(wanted) if flagged is None else flagged
-    of_dark = _dark(correction, dark)
-    LOG.info("corrects %d frames to %s, dark: %s, flagged pixels: %s", total, wanted, dark, flagged)
-    corrector = Corrector(
-        correction,
-        "float32" if display else wanted,
-        bit_depth=bit_depth,
-        flagged=flagged,
-        dark=of_dark,
-        sensor=sensor,
-        workers=workers,
-    )
+    darks = file_darks(correction, dark, files)
+    LOG.info("corrects %d frames to %s, flagged pixels: %s", total, wanted, flagged)
+
+    def prepared(dark: Dark) -> Corrector:
+        return Corrector(
+            correction,
+            "float32" if display else wanted,
+            bit_depth=bit_depth,
+            flagged=flagged,
+            dark=dark,
+            sensor=sensor,
+            workers=workers,
+        )
+
+    on = _Correcting(correction.dark, darks, prepared, files[0])
 
     def corrected(inputs: list[Path]) -> Iterator[NDArray[Any]]:
-        nonlocal done, said
-        for _, frames in stream_frames(inputs):
-            if done == 0:
-                said += _warn_of_dark(frames[0], correction, of_dark)
-            native = frames.dtype.newbyteorder("=")
-            taken = frames.astype(native if native in FAST else np.float32, copy=False)
-            for frame in corrector.apply(taken):
+        nonlocal done
+        for file, frames in stream_frames(inputs):
+            for frame in on.corrected(file, frames):
                 yield picture(frame, display) if display else frame
             done += len(frames)
             if progress is not None:
                 progress(done, total, "correcting")
 
-    frame_bytes = wanted.itemsize * correction.shape[0] * correction.shape[1]
-    mark = f"{_MARK}{origin and f', {origin}'}"
+    def write(path: Path, inputs: list[Path]) -> None:
+        shapes = {file: headers[file].shape for file in inputs}
+        _write(path, corrected(inputs), shapes, dtype=wanted, mark=mark, history=history)
+
+    def history(file: Path) -> list[str]:
+        return [f"dark: {darks.named(file)}", f"{bad} flagged pixels: {flagged}"]
+
+    bad = int(np.count_nonzero(~usable(correction.flags)))
+    mark = ", ".join(filter(None, (_MARK, origin)))
     if not is_folder(output):
         with write_whole(output, force=force) as temporary:
-            _write(temporary, corrected(files), nbytes=total * frame_bytes, mark=mark)
+            write(temporary, files)
     else:
-        with folder_beside(output) as folder:
-            for file, path in zip(files, outputs, strict=True):
-                nbytes = headers[file].shape[0] * frame_bytes
-                _write(folder / path.name, corrected([file]), nbytes=nbytes, mark=mark)
-            output.mkdir(exist_ok=True)
-            for path in outputs:
-                (folder / path.name).replace(path)
-    bad = int(np.count_nonzero(~usable(correction.flags))) if flagged == "nan" else 0
-    said += _warn_of_limited(corrector.clipped, total * correction.flags.size, wanted)
-    counts = corrector.clipped, corrector.extrapolated, corrector.replaced, bad
+        _fill(output, dict(zip(outputs, files, strict=True)), write)
+    said += darks.findings + on.findings + warn_of_as_dark(on.as_dark, darks.names[0])
+    made = on.corrector
+    said += _warn_of_limited(made.clipped, total * correction.flags.size, wanted)
+    counts = made.clipped, made.extrapolated, made.replaced, bad if flagged == "nan" else 0
     return Corrected(wanted.name, total, *counts, said)
+
+
+class _Correcting:
+    """Frames on their way through a corrector, which is made anew where they have another dark."""
+
+    def __init__(
+        self,
+        stored: Array | None,
+        darks: FileDarks,
+        prepared: Callable[[Dark], Corrector],
+        first: Path,
+    ) -> None:
+        self._stored, self._darks, self._prepared = stored, darks, prepared
+        self._file: Path | None = None
+        self._shares, self._dark = darks.shares[first], darks.of(first)
+        self.corrector = prepared(self._dark)
+        self.findings: Findings = ()
+        self.as_dark: list[Path] = []
+
+    def corrected(self, file: Path, frames: Array) -> Array:
+        """Correct some frames of a file."""
+        if file != self._file:
+            self._go_on(file, frames[0])
+        native = frames.dtype.newbyteorder("=")
+        return self.corrector.apply(
+            frames.astype(native if native in FAST else np.float32, copy=False)
+        )
+
+    def _go_on(self, file: Path, frame: Array) -> None:
+        """Take the dark of the next file, whose first frame is compared with it."""
+        shares = self._darks.shares[file]
+        if shares != self._shares:
+            last = self.corrector
+            self._shares, self._dark = shares, self._darks.of(file)
+            self.corrector = self._prepared(self._dark)
+            self.corrector.clipped, self.corrector.extrapolated = last.clipped, last.extrapolated
+        dark = self._stored if isinstance(self._dark, str) else self._dark
+        if dark is not None:
+            if self._file is None:
+                self.findings = warn_of_darker(frame, dark)
+            if file in self._darks.suspects and is_as_dark(frame, dark):
+                self.as_dark.append(file)
+        self._file = file
+
+
+def _fill(output: Path, files: Mapping[Path, Path], write: Callable[..., None]) -> None:
+    """Write a file for each input into a folder, all or none."""
+    with folder_beside(output) as folder:
+        for path, file in files.items():
+            write(folder / path.name, [file])
+        output.mkdir(exist_ok=True)
+        for path in files:
+            (folder / path.name).replace(path)
 
 
 def _dtype(
@@ -201,12 +269,24 @@ def _dtype(
     return np.dtype(np.uint8)
 
 
-def _write(path: Path, frames: Iterator[NDArray[Any]], *, nbytes: int, mark: str) -> None:
-    """Write frames to a TIFF, or the only one to a PNG."""
+def _write(
+    path: Path,
+    frames: Iterator[NDArray[Any]],
+    shapes: Mapping[Path, tuple[int, int, int]],
+    *,
+    dtype: np.dtype[Any],
+    mark: str,
+    history: Callable[[Path], list[str]],
+) -> None:
+    """Write the frames of some files to a FITS file or a TIFF, or the only one to a PNG."""
     if is_picture(path):
         for frame in frames:
             write_png(path, frame, description=mark)
+    elif path.suffix.lower() in fits.SUFFIXES:
+        sources = [(file, shape, history(file)) for file, shape in shapes.items()]
+        fits.write_frames(path, frames, sources, dtype=dtype, mark=mark)
     else:
+        nbytes = dtype.itemsize * sum(map(math.prod, shapes.values()))
         write_frames(path, frames, nbytes=nbytes, description=mark)
 
 
@@ -230,14 +310,14 @@ def _refuse_pictures(output: Path, total: int, dtype: np.dtype[Any]) -> None:
 
 def is_folder(output: Path) -> bool:
     """Whether an output is a folder of files, by its name."""
-    return output.suffix.lower() not in (".tif", ".tiff", ".png")
+    return output.suffix.lower() not in (".tif", ".tiff", ".png", *fits.SUFFIXES)
 
 
-def _outputs(output: Path, files: list[Path]) -> list[Path]:
+def _outputs(output: Path, files: list[Path], display: Display | None) -> list[Path]:
     """Name what will be written."""
     if not is_folder(output):
         return [output]
-    names = [f"{file.stem}.tif" for file in files]
+    names = [f"{file.stem}.tif" if display else _name(file) for file in files]
     if repeated := [name for name in names if names.count(name) > 1]:
         raise FileError(f"{output}: two inputs would become '{repeated[0]}': correct them apart")
     return [output / name for name in names]
@@ -246,6 +326,14 @@ def _outputs(output: Path, files: list[Path]) -> list[Path]:
 def is_corrected(description: str) -> bool:
     """Whether the text of a file says that this module has written it."""
     return description.startswith(_MARK)
+
+
+def _name(file: Path) -> str:
+    """Name of a corrected file in a folder: of FITS files with a suffix that is written."""
+    if suffix_of(file) not in fits.READ:
+        return f"{file.stem}.tif"
+    names = (file.name, file.stem)  # the second of compressed files
+    return next((n for n in names if n.lower().endswith(fits.SUFFIXES)), f"{file.stem}.fits")
 
 
 def warn_of_corrected(headers: Mapping[Path, Header], origin: str) -> Findings:
@@ -263,22 +351,6 @@ def warn_of_corrected(headers: Mapping[Path, Header], origin: str) -> Findings:
     return say(Finding("corrected", words, "input"))
 
 
-def _warn_of_dark(frame: NDArray[Any], correction: Correction, dark: Dark) -> Findings:
-    """Warn of a frame from which the dark was probably subtracted before."""
-    given = correction.dark if isinstance(dark, str) else dark
-    if given is None:
-        return ()
-    offset = np.asarray(given.mean if isinstance(given, FrameStatistics) else given)
-    level, below = np.nanmedian(offset), np.nanmedian(offset - frame)
-    if level > 0 and below > DARKER * level:
-        words = (
-            f"the first frame is darker than the dark by {below:.4g} of {level:.4g} DN in the "
-            "median: give raw frames, or 'dark' (--dark) none if the dark was subtracted from them"
-        )
-        return say(Finding("bright_dark", words, "input"))
-    return ()
-
-
 def _warn_of_limited(limited: int, values: int, dtype: np.dtype[Any]) -> Findings:
     """Warn where most values are outside of the range of the output."""
     if limited <= values / 2:
@@ -291,18 +363,6 @@ def _warn_of_limited(limited: int, values: int, dtype: np.dtype[Any]) -> Finding
         f"choose 'dtype' (--dtype) {remedy}"
     )
     return say(Finding("limited", words, "input"))
-
-
-def _dark(correction: Correction, dark: str) -> Dark:
-    """Give the dark frame that an option names, for the argument of `Corrector`."""
-    if dark == "stored":
-        return "stored"
-    refuse_dark(correction, dark)
-    if dark == "none":
-        return None
-    statistics = average(dark)
-    refuse_subtracted(statistics, dark)
-    return statistics
 
 
 PERCENTILES = (0.5, 99.5)

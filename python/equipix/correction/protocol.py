@@ -182,8 +182,8 @@ def with_dark(correction: _C, dark: Dark) -> _C:
     if is_stored(dark):
         if correction.needs_dark:
             raise InputError(
-                "'dark' is 'stored' but this calibration holds no dark frame: give one, or None if "
-                "it is already subtracted"
+                "'dark' is 'stored', but this calibration holds no dark frame: give one. None is "
+                "for frames from which it is subtracted already"
             )
         return correction
     refuse_dark(correction, dark)

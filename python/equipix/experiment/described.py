@@ -43,8 +43,8 @@ from equipix.io.formats import read_mask
 from equipix.io.paths import as_path
 from equipix.measured.average import average
 from equipix.measured.colour import Colours
+from equipix.measured.darks import settings_in
 from equipix.measured.means import Averaged
-from equipix.measured.noise import NoiseModel
 from equipix.measured.statistics import FrameStatistics, refuse_subtracted
 from equipix.shown import Brief
 
@@ -155,7 +155,9 @@ class Described(Brief, Generic[_Manifest]):
             dark = self._statistics(name, entries[k].frames, None, workers, progress)
             files = ", ".join(map(str, self._entry(entries[k].frames)))
             refuse_subtracted(dark, f"{self.path}: {name_of_dark(k, len(entries))} {files}")
-            frames.append(dark)
+            pairs = entries[k].settings._asdict().items()
+            stated = {key: value for key, value in pairs if value is not None}
+            frames.append(replace(dark, metadata=dark.metadata | stated))
         shares = [tuple(each[k] for k in used) for each in shares]
         return Darks(tuple(frames), shares, None, choice.words, choice.findings)
 
@@ -218,15 +220,17 @@ class Described(Brief, Generic[_Manifest]):
         return excluded
 
     def _provenance(
-        self, hashes: Mapping[Path, str], noise: NoiseModel | None, **more: object
+        self, hashes: Mapping[Path, str], averaged: Averaged | None, **more: object
     ) -> dict[str, Any]:
-        """Sensor, noise, the hashes of the files, and what else is given, as JSON values."""
+        """Sensor, noise, dark, hashes of the files, and what else is given, as JSON values."""
         folder = self.path.parent
+        noise, dark = (None, None) if averaged is None else (averaged.noise, averaged.dark)
         return {
             "experiment": str(self.path),
             "sensor": self.manifest.sensor.model_dump(),
             **more,
             "noise": None if noise is None else asdict(noise),
+            "dark_settings": settings_in({} if dark is None else dark.metadata)._asdict(),
             "inputs": {os.path.relpath(file, folder): digest for file, digest in hashes.items()},
         }
 

@@ -212,7 +212,7 @@ class Experiment(Described[Manifest]):
             start = first.fit
         origin = self._provenance(
             hashes,
-            averaged.noise,
+            averaged,
             exposures=[exposure.name for exposure in self.manifest.exposure],
             darks=list(darks.words),
             measured_shifts=shifts.tolist(),

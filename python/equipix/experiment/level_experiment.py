@@ -107,7 +107,7 @@ class LevelExperiment(Described[LevelManifest]):
             {"name": name, "value": level.value, "unit": level.unit, "mean": mean, "dark": dark}
             for name, level, mean, dark in named
         ]
-        origin = self._provenance(hashes, averaged.noise, levels=written)
+        origin = self._provenance(hashes, averaged, levels=written)
         return fitted(levels, order=order, by=by, workers=workers, provenance=origin)
 
     def _falling(self, levels: Levels) -> str | None:

@@ -4,8 +4,11 @@ The only module that imports astropy. Pages beside the viewed image are extensio
 their array; its exact name stands in the keyword ARRAY.
 """
 
+import math
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +24,13 @@ SUFFIXES = (".fits", ".fit", ".fts")
 READ = (*SUFFIXES, ".fz", ".gz")
 """Suffixes of files of frames; compressed ones are not written."""
 
-_NAME, _TEXT = "ARRAY", "EQUIPIX-METADATA"
+_NAME, _TEXT, _MARK = "ARRAY", "EQUIPIX-METADATA", "EQUIPIX"
+
+_OF_VALUES = ("BSCALE", "BZERO", "BLANK", "DATAMIN", "DATAMAX", "CHECKSUM", "DATASUM", "INHERIT")
+"""Keywords that say something of the values of an image, and do not hold for others."""
+
+_TYPES = ("IMAGETYP", "OBSTYPE", "FRAME")
+"""Keywords of what an image shows."""
 
 _USES = {"flat": "divide frames by it", "gain": "multiply frames by it"}
 
@@ -102,6 +111,13 @@ def settings(path: Path) -> tuple[float | None, float | None]:
         return _keyword(units, "EXPTIME", "EXPOSURE"), _keyword(units, "CCD-TEMP", "SET-TEMP")
 
 
+def image_type(path: Path) -> str:
+    """What an image shows in the words of its header, such as "Dark Frame"; empty without any."""
+    with _astropy().open(path) as units:
+        found = (unit.header.get(name) for name in _TYPES for unit in units)
+        return next((value for value in found if isinstance(value, str)), "")
+
+
 def _keyword(units: Any, *names: str) -> float | None:
     """Value of the first of some keywords that a header holds."""
     found = (unit.header[name] for name in names for unit in units if name in unit.header)
@@ -118,6 +134,7 @@ def header(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any], str]:
         *_, rows, cols = images[0].shape
         count = sum(int(np.prod(unit.shape[:-2])) for unit in images)
         text = units[_TEXT].data.tobytes().decode() if _TEXT in units else ""
+        text = text or str(images[0].header.get(_MARK, ""))
         return (count, rows, cols), native(_part(images[0], 1)).dtype, text
 
 
@@ -128,6 +145,81 @@ def stream_frames(path: Path) -> Iterator[NDArray[Any]]:
             *above, rows, cols = unit.shape
             for index in np.ndindex(*above):
                 yield native(np.reshape(_part(unit, None, index), (1, rows, cols)))
+
+
+def write_frames(
+    path: Path,
+    frames: Iterable[NDArray[Any]],
+    sources: Iterable[tuple[Path, tuple[int, int, int], Sequence[str]]],
+    *,
+    dtype: np.dtype[Any],
+    mark: str,
+) -> None:
+    """Write frames as the images of a file, holding one at a time.
+
+    Parameters
+    ----------
+    path : Path
+        Output, written in place: a file that does not exist.
+    frames : iterable of ndarray, shape (rows, cols)
+        The frames of all sources, of one type.
+    sources : iterable of (Path, shape, lines of history)
+        Files that the frames were made from, each with the shape (n, rows, cols) of its frames. An
+        image gets the axes and the header of that in a FITS file, with what the primary header
+        has beside it.
+    dtype : dtype
+        Type of the frames.
+    mark : str
+        ASCII text, stored with each image.
+    """
+    fits, rest = _astropy(), iter(frames)
+    for file, shape, history in sources:
+        for kept, axes in _heads(file, shape):
+            stream = fits.StreamingHDU(str(path), _head(kept, axes, dtype, mark, history))
+            with closing(stream):
+                for frame in islice(rest, math.prod(axes[:-2])):
+                    # FITS has no unsigned numbers of 16 bits: 0 is stored as -32768.
+                    whole = dtype == np.uint16
+                    stream.write((frame ^ 2**15).view(np.int16) if whole else frame)
+
+
+def _heads(path: Path, shape: tuple[int, int, int]) -> list[tuple[Any, tuple[int, ...]]]:
+    """Header and axes of each image that the frames of a file came from."""
+    fits = _astropy()
+    if path.suffix.lower() not in READ:
+        return [(fits.Header(), shape if shape[0] > 1 else shape[1:])]
+    found = []
+    with fits.open(path) as units:
+        for unit in _images(path, units):
+            unit.verify("silentfix+ignore")
+            kept = unit.header.copy(strip=True)
+            if unit is not units[0]:
+                kept.extend(units[0].header.copy(strip=True), unique=True)
+            found.append((kept, unit.shape))
+    return found
+
+
+def _head(
+    kept: Any, axes: tuple[int, ...], dtype: np.dtype[Any], mark: str, history: Sequence[str]
+) -> Any:
+    """Header of an image of other values: what is kept of another, and how they were made."""
+    head = _astropy().PrimaryHDU().header.copy()
+    head["BITPIX"] = -32 if dtype.kind == "f" else 8 * dtype.itemsize
+    head["NAXIS"] = len(axes)
+    place = "NAXIS"
+    for number, size in enumerate(reversed(axes), start=1):
+        head.set(f"NAXIS{number}", size, after=place)
+        place = f"NAXIS{number}"
+    head.extend(kept, strip=True, unique=True)
+    for name in _OF_VALUES:
+        head.remove(name, ignore_missing=True)
+    if dtype == np.uint16:
+        head["BSCALE"], head["BZERO"] = 1, 2**15
+    head["BUNIT"] = head.get("BUNIT") or "adu"
+    head[_MARK] = mark
+    for line in (mark, *history):
+        head.add_history(line.encode("ascii", "replace").decode())
+    return head
 
 
 def _part(unit: Any, size: int | None, index: tuple[int, ...] = ()) -> Any:

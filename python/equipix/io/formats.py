@@ -182,7 +182,12 @@ def _parsed(text: str) -> dict[str, Any]:
 
 
 def saved_kind(path: Path) -> str | None:
-    """Kind of content in a file that stands in the place of frames; None of other files.
+    """Kind of content in a file that stands in the place of frames; None of other files."""
+    return _kind(saved_content(path))
+
+
+def saved_content(path: Path) -> dict[str, Any]:
+    """Metadata in a file that `save_pages` wrote; empty of other files.
 
     Files of whole numbers, which cameras write, are not searched.
     """
@@ -190,13 +195,13 @@ def saved_kind(path: Path) -> str | None:
     if suffix in _DESCRIPTIONS:
         file, _ = arrays.split(path)
         with reading(file):
-            return _kind(_DESCRIPTIONS[suffix](file))
+            return _parsed(_DESCRIPTIONS[suffix](file))
     is_searched = suffix in SUFFIXES and frame_format(path)[1].kind == "f"
-    return _kind(header(path).description) if is_searched else None
+    return _parsed(header(path).description) if is_searched else {}
 
 
-def _kind(text: str) -> str | None:
-    kind = _parsed(text).get("kind")
+def _kind(content: dict[str, Any]) -> str | None:
+    kind = content.get("kind")
     return kind if isinstance(kind, str) else None
 
 
@@ -231,7 +236,7 @@ def raw_header(path: Path) -> Header:
     if suffix_of(path) in _DESCRIPTIONS:
         refuse_saved(path)
     found = header(path)
-    _refuse_kind(path, _kind(found.description) if found.dtype.kind == "f" else None)
+    _refuse_kind(path, _kind(_parsed(found.description)) if found.dtype.kind == "f" else None)
     return found
 
 

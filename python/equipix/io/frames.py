@@ -172,6 +172,14 @@ def apart(index: int, one: float | None, other: float | None, tolerance: float) 
     return abs(one - other) > limit + 1e-9 * abs(one)
 
 
+def image_type(path: Path) -> str:
+    """What an image shows by the header of a FITS file, such as "Dark Frame"; else empty."""
+    if suffix_of(path) not in fits.READ:
+        return ""
+    with reading(path):
+        return fits.image_type(path)
+
+
 class Header(NamedTuple):
     """Shape (n, rows, cols) and dtype of the frames of a file, and the text stored with them."""
 

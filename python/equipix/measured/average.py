@@ -36,6 +36,7 @@ from equipix.io.frames import (
 )
 from equipix.io.paths import find_files
 from equipix.io.record import made, now, read_record
+from equipix.measured.darks import taken_with
 from equipix.measured.saturation import level_of
 from equipix.measured.statistics import FrameStatistics, _masked, _step, _subtract, saved_shape
 from equipix.measured.stream import Rejection, batches, sum_dtype, unmasked
@@ -82,7 +83,8 @@ def average(
     Returns
     -------
     FrameStatistics
-        Mean, unbiased variance of one frame, variance of the mean, and counts.
+        Mean, unbiased variance of one frame, variance of the mean, and counts. Of FITS and raw
+        files `metadata` hold ``exposure_s`` and ``temperature_c``, where the headers agree.
 
     Raises
     ------
@@ -133,16 +135,18 @@ def average(
         progress,
     )
     taken = _paths_or_frames(frames)
+    settings: dict[str, float] = {}
     with naming_memory("averaging"):
         if isinstance(taken, list):
             statistics = _average_files(taken, how)
+            settings = taken_with(find_files(taken))
         else:
             statistics = _average_batches(batches(taken), how, operator.length_hint(frames))
         if not statistics.count.any():
             raise InputError("'frames' holds no finite number: give frames with numbers")
         options = {"saturation": how.level, "reject": statistics.reject}
         # A saved average brings its own.
-        metadata = statistics.metadata or made(options=options, started=started)
+        metadata = statistics.metadata or made(options=options, started=started, **settings)
         found = dataclasses.replace(_subtract(statistics, offset), metadata=metadata)
         shape, level, less = found.mean.shape, found.saturation, "no" if dark is None else "its"
         text = "averaged %d frames of %d × %d pixels, saturation level %s, %s dark subtracted"
