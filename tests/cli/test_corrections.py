@@ -10,7 +10,7 @@ import pytest
 
 import equipix
 from equipix import bolometer, lens, simulate
-from equipix.io.frames import read_frames
+from equipix.io.frames import header, read_frames
 from equipix.io.tiff import write_frames
 from equipix.report.maps import maps_of
 
@@ -231,6 +231,39 @@ class TestBolometer:
         status, _, err = run(*self.command(folder, out, *more, "--order", "2"))
         assert status == 0
         assert "--cold at state 0 has the pattern of 'shutter' at state 4" in err
+
+    def test_corrects_frames_at_a_state(self, run, folder, tmp_path):
+        out, frames = tmp_path / "dynamic.npz", folder / "hot2.npy"
+        assert run(*self.command(folder, out, "--order", "2"))[0] == 0
+        done = tmp_path / "done.tif"
+        state = ("--substrate-c", "20", "--bias-v", "2")
+        status, printed, err = run("correct", out, frames, "-o", done, *state, "--json")
+        assert (status, err) == (0, "")
+        told = json.loads(printed)
+        assert told["unit"] == "DN"
+        wanted = equipix.load(out).correction(20, 2).correct(np.load(frames).astype(np.float32))
+        np.testing.assert_array_equal(read_frames(done)[0], wanted)
+        assert "substrate_c 20, bias_v 2" in header(done).description
+        equipix.Polynomial(np.ones((2, 24, 32)), np.zeros((24, 32), np.uint32)).save(
+            tmp_path / "plain.npz"
+        )
+        no = tmp_path / "no.tif"
+        for words, *given in (
+            ("give the state to equipix correct (--substrate-c)", out, frames),
+            ("--substrate-c is missing, but", out, frames, "--bias-v", "2"),
+            ("--substrate-c is 90 °C, but the references cover", out, frames, *state[:1], "90"),
+            ("--substrate-c is given, but", tmp_path / "plain.npz", frames, *state[:2]),
+        ):
+            status, _, err = run("correct", *given, "-o", no)
+            assert (status, words in err, no.exists()) == (1, True, False), err
+
+    def test_asks_for_the_bias_where_several_were_calibrated(self, run, folder, tmp_path):
+        out, volts = tmp_path / "dynamic.npz", "1.8 2 2 2 2.2"
+        command = [*self.command(folder, out, "--order", "1", "--bias-order", "1")]
+        command[command.index("--bias-v") + 1] = volts
+        assert run(*command)[0] == 0
+        given = ("correct", out, folder / "hot2.npy", "--substrate-c", "20", "-o", tmp_path / "no")
+        assert f"--bias-v is missing, but {out} follows it: give its value" in run(*given)[2]
 
     @pytest.mark.parametrize(
         ("more", "celsius", "words"),

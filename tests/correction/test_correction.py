@@ -314,6 +314,11 @@ class TestFiles:
             correct_files(bent, images[1], tmp_path / "out.tif", dark=[dark])
         assert sorted(tmp_path.iterdir()) == before
 
+    def test_a_missing_dark_is_asked_for(self, calibration, images, tmp_path):
+        words = "'dark' .* is 'stored': give dark frames, or 'none' .* if the dark is subtracted"
+        with pytest.raises(InputError, match=words):
+            correct_files(calibration, images[1], tmp_path / "out.tif")
+
 
 class TestLoad:
     @pytest.mark.parametrize("suffix", [".tif", ".npz"])

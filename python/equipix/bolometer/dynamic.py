@@ -163,5 +163,5 @@ def _check_inside(
     if not np.isfinite(value) or not (inside or extrapolate):
         raise InputError(
             f"'{name}' is {value:g} {unit}, but the references cover {ends[0]:g} to {ends[1]:g} "
-            f"{unit}: take references there, or set extrapolate=True"
+            f"{unit}: take references there, or set extrapolate=True in Python"
         )

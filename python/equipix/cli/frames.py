@@ -125,8 +125,8 @@ def correct(
     counts = known(
         limited_values=done.limited if whole else None,
         extrapolated_values=done.extrapolated,
-        replaced_pixels=done.replaced,
-        unusable_pixels=done.flagged,
+        replaced_pixels=done.replaced or None,
+        unusable_pixels=done.flagged or None,
         unit="DN" if options["display"] is None else None,
     )
     result = {"output": str(output), "frames": done.frames, "dtype": done.dtype, **counts}
