@@ -99,7 +99,8 @@ class TestDarks:
             (
                 ("m31-20.fits", 5, LIGHT),
                 ["dark?-0.fits"],
-                r"'dark1-0.fits' holds 1 s, but the mean of .* dark\?-0.fits is 3 s: give .*once",
+                r"the files of .* dark\?-0.fits have different values of the exposure time: "
+                r"'dark1-0.fits' holds 1 s, 'dark5-0.fits' 5 s: give .* once",
             ),
             (
                 ("m31-20.fits", 5, LIGHT),
@@ -135,9 +136,10 @@ class TestDarks:
         with pytest.warns(InputWarning):
             done = correct_files(response, source, night / "b.tif", dark=dark)
         time, temperature = (each.message for each in done.findings)
-        assert {each.kind for each in done.findings} == {"dark_settings"}
-        assert re.match(rf"m31-7.fits: taken with 7 s, but {named}.* with 5 s, ", time)
-        assert re.match(rf"warm.fits: taken with -4 °C, but {named}.* with -10 °C, ", temperature)
+        assert {each.kind for each in done.findings} == {"other_dark"}
+        assert re.match(rf"{named} was taken with .* 5 s, m31-7.fits with 7 s by its files, ", time)
+        wanted = rf"{named} was taken with .* -10 °C, warm.fits with -4 °C by its files \(limit "
+        assert re.match(wanted, temperature)
 
     @pytest.mark.parametrize("typed", [True, False])
     def test_dark_frames_among_the_frames_are_a_finding(self, response, night, typed):

@@ -322,8 +322,6 @@ def test_averages_and_results_keep_what_their_darks_were_taken_with(tmp_path, ca
     average.save(tmp_path / "master.tif")
     assert settings_of(tmp_path / "master.tif") == Settings(1.0, -9.95)
     assert settings_in(mixed([average] * 2, (0.5, 0.5)).metadata) == Settings(1.0, -9.95)
-    several = equipix.average([tmp_path / f"level{k}.fits" for k in (1, 2)])
-    assert settings_in(several.metadata) == Settings()
     path.write_text(path.read_text().replace("dark1.fits", "master.tif"))
     known = LevelExperiment.load(path).run(order=0).metadata["dark_settings"]
     assert known == {"exposure_s": 1.0, "temperature_c": -9.95}

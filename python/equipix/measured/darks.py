@@ -171,7 +171,7 @@ def taken_with(files: Sequence[Path]) -> dict[str, float]:
         return {}
     try:
         found = common_settings("", Settings(), files, TOLERANCE_K, _PLAIN)
-    except FileError:  # frames of several exposure times
+    except FileError:  # frames of several temperatures
         return {}
     pairs = zip(KEYS, found, strict=True)
     return {key: value for (key, *_), value in pairs if value is not None}
