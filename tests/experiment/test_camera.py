@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tracemalloc
 import warnings
 
@@ -14,6 +15,8 @@ import equipix
 from equipix import CameraExperiment, errors, metrics
 from equipix.io.frames import read_frames
 from equipix.io.tiff import write_frames
+from equipix.metrics.emva import transfer_of
+from equipix.report.camera import bounds_of, figures_of
 from given import CAMERA, camera_levels, written_camera
 from reference import emva
 
@@ -104,6 +107,38 @@ class TestTruth:
             assert np.isnan([found.dark_current_mean, found.dark_current_variance]).all()
             noise = np.mean([emva.pair_moments(pair)[1] for pair in off])
             assert found.dark_noise_dn == pytest.approx(np.sqrt(noise))
+
+    def test_lines_of_the_darks_are_those_of_least_squares(self):
+        on, off, photons, times = camera_levels(4, shape=(16, 20))
+        found = metrics.emva_transfer(on, off, photons, exposure_s=times)
+        slopes, (_, noise) = np.polyfit(times, [emva.pair_moments(pair) for pair in off], 1)
+        gain = found.gain_dn_per_e
+        assert found.dark_noise_dn == pytest.approx(np.sqrt(noise))
+        assert found.dark_current_mean == pytest.approx(slopes[0] / gain)
+        assert found.dark_current_variance == pytest.approx(slopes[1] / gain**2)
+
+    def test_times_that_hardly_differ_leave_the_noise_of_the_darks(self):
+        on, off, photons, times = camera_levels(4, shape=(16, 20), current=0.0)
+        rng = np.random.default_rng(1)
+        times = 0.01 + 1e-6 * rng.standard_normal(len(times))
+        found = metrics.emva_transfer(on, off, photons, exposure_s=times)
+        assert np.isnan([found.dark_current_mean, found.dark_current_variance]).all()
+        noise = np.mean([emva.pair_moments(pair)[1] for pair in off])
+        assert found.dark_noise_dn == pytest.approx(np.sqrt(noise))
+
+    @pytest.mark.parametrize(("column", "limit"), [(0, 0.5 * np.sqrt(10)), (1, 0.5 * 10)])
+    def test_a_line_counts_up_to_its_error_at_the_time_0(self, column, limit):
+        # The scatter is orthogonal to a line: its error at 0 is t s √(1/4 + 2.5²/5), s² = 4 a²/2.
+        times, scatter = np.array([1.0, 2.0, 3.0, 4.0]), np.array([1.0, -1.0, -1.0, 1.0])
+        highest = limit / (4.303 * np.sqrt(2) * np.sqrt(1.5))
+        for share, known in ((0.99, True), (1.01, False)):
+            off = np.stack([100 + times, np.full(4, 10.0)], axis=1)
+            off[:, column] += share * highest * scatter
+            on = off + np.outer([100.0, 200, 300, 400], [1, 1])
+            found = transfer_of(on, off, np.arange(1.0, 5), times)
+            slopes = found.dark_current_mean, found.dark_current_variance
+            assert np.isfinite(slopes[column]) == known
+            assert np.isfinite(slopes[1 - column])
 
     @pytest.mark.parametrize(
         ("darks", "times", "words"),
@@ -221,6 +256,100 @@ def test_findings_name_what_limits_the_figures(tmp_path):
         found = figures(path)
     assert [each.kind for each in found.findings] == ["saturation", "quantisation"]
     assert len(said) == 2
+    bounds = bounds_of(found)
+    above = {"saturation_photons", "saturation_e"}
+    above |= {
+        f"{name}{form}" for name in ("snr_max", "dynamic_range") for form in ("", "_db", "_bits")
+    }
+    assert {key for key, each in bounds.items() if each == "above"} == above
+    assert bounds["inverse_snr_max_percent"] == bounds["dark_noise_dn"] == "below"
+
+
+def replaced(path, key, of):
+    """A manifest with other numbers of a key."""
+    text = re.sub(rf"{key} = (.*)", lambda at: f"{key} = {of(float(at[1]))!r}", path.read_text())
+    path.write_text(text)
+    return path
+
+
+def small(folder, **options):
+    return written_camera(folder, 3, **{"shape": (16, 20), "count": 18} | options)
+
+
+@pytest.mark.filterwarnings("ignore::equipix.errors.EquipixWarning")
+class TestFindings:
+    """What limits the figures, from files of 16×20 pixels, and the figures that it concerns."""
+
+    def kinds(self, path):
+        return {each.kind: each.message for each in figures(path).findings}
+
+    def test_times_that_hardly_differ(self, tmp_path):
+        path = replaced(small(tmp_path), "exposure_s", lambda time: 0.01 + 1e-4 * time)
+        said = self.kinds(path)
+        assert [*said] == ["spread"]
+        assert "from 0.01 to 0.01 s" not in said["spread"]
+        assert "do not determine dark current by the mean, dark current by the" in said["spread"]
+
+    def test_times_that_contradict_the_noise(self, tmp_path, run):
+        path = small(tmp_path, current=2e5, read=2.0)
+        said = self.kinds(replaced(path, "exposure_s", lambda time: time + 0.02))
+        assert "times" in said
+        assert "quantisation" not in said
+        assert "at the time 0, which no noise has" in said["times"]
+        assert "'exposure_s'" in said["times"]
+        found = json.loads(run("emva", path, "--json")[1])
+        unknown = {key for key, value in found.items() if value is None} - {"output"}
+        assert {key.partition("_")[0] for key in unknown} == {"dark", "threshold", "dynamic"}
+        assert found["saturation_e"] > 0
+
+    def test_quantisation_gives_the_bounds_of_the_standard(self, tmp_path, run):
+        path = small(tmp_path, gain=0.01)
+        assert "quantisation" in self.kinds(path)
+        found = json.loads(run("emva", path, "--json")[1])
+        gain = found["gain_dn_per_e"]
+        assert found["dark_noise_dn"] == pytest.approx(np.sqrt(0.24))
+        assert found["dark_noise_e"] == pytest.approx(0.40 / gain, rel=0.02)
+        assert found["threshold_e"] == pytest.approx(np.sqrt(0.24 / gain**2 + 0.25) + 0.5)
+        assert found["dark_current_variance_e_per_s"] is None
+        below = ("dark_noise_dn", "dark_noise_e", "threshold_photons", "threshold_e")
+        above = ("dynamic_range", "dynamic_range_db", "dynamic_range_bits")
+        assert found["bounds"] == dict.fromkeys(below, "below") | dict.fromkeys(above, "above")
+        assert re.search(
+            r"temporal dark noise with quantisation +DN +below 0\.4899", run("emva", path)[1]
+        )
+
+    def test_few_levels_and_frames(self, tmp_path):
+        said = self.kinds(small(tmp_path, count=6, spatial=15))
+        assert re.match(r"\d levels lie between 5 and 95 % .*limit 9", said["levels"])
+        assert said["frames"].startswith("[spatial] has 15 frames with light and 15 without")
+
+    @pytest.mark.parametrize(
+        ("cfa", "words"),
+        [
+            (None, "every 2 rows and 2 columns by .* no 'cfa' is given in .sensor., .*'RGGB' or"),
+            ("GRBG", "otherwise than 'cfa' in .sensor., 'GRBG', so planes .* write cfa='RGGB' or"),
+            ("RGGB", None),
+        ],
+    )
+    def test_colours_that_cfa_does_not_name(self, tmp_path, cfa, words):
+        efficiency = np.tile([[0.45, 0.6], [0.6, 0.3]], (8, 10))
+        path = small(tmp_path, cfa=cfa, efficiency=efficiency, spatial=0)
+        found = CameraExperiment.load(path).figures()
+        for each in found.values():
+            said = [finding.message for finding in each.findings if finding.kind == "cfa"]
+            assert [bool(re.search(words or "", one)) for one in said] == ([True] if words else [])
+
+    def test_stripes_may_be_channels(self, tmp_path):
+        efficiency = np.tile([[0.6, 0.55]], (16, 10))
+        (said,) = figures(small(tmp_path, efficiency=efficiency, spatial=0)).findings
+        assert (said.kind, said.severity) == ("cfa", "note")
+        assert "every 2 columns by 9%, as channels of the read-out" in said.message
+
+    def test_light_of_other_levels_is_named_by_its_exposures(self, tmp_path):
+        path = replaced(small(tmp_path), "photons", lambda photons: 1e5 - photons)
+        words = "the light in photons is .* at exposure '.*' and .* at exposure '.*', where"
+        with pytest.raises(errors.FileError, match=words):
+            figures(path)
 
 
 def test_photons_in_another_unit_are_named(camera, tmp_path):
@@ -234,6 +363,11 @@ def test_photons_in_another_unit_are_named(camera, tmp_path):
     with pytest.warns(errors.InputWarning, match=r"quantum efficiency is \d+.* \(limit 1\.1\)"):
         found = figures(path)
     assert np.isnan(found.transfer.quantum_efficiency)
+    words = {each.key: each.number for each in figures_of(found)}
+    assert {key for key, each in words.items() if each == "needs photons"} == {
+        *("responsivity_dn_per_photon", "quantum_efficiency_percent"),
+        *("threshold_photons", "saturation_photons"),
+    }
 
 
 def test_memory_does_not_grow_with_frames_and_levels(tmp_path):

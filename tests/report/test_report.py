@@ -24,6 +24,7 @@ from equipix.pictures import new_figure
 from equipix.report.drawing import (
     draw_convergence,
     draw_histogram,
+    draw_histogram,
     draw_map,
     draw_profiles,
     draw_shifts,
@@ -536,8 +537,11 @@ class TestCamera:
         for plane in ("R", "G1", "G2", "B"):
             assert f", plane {plane}</h2>" in text
         assert re.search(r"figure +unit +R +G1 +G2 +B", printed)
+        assert text.count("<h3>Planes side by side</h3>") == 1
+        assert printed.endswith(f"output  {out}\n")
         found = json.loads(run("emva", path, "--json")[1])
         assert [*found] == ["output", "R", "G1", "G2", "B"]
+        assert found["output"] is None
         assert found["R"]["gain_dn_per_e"] == pytest.approx(0.25, rel=0.2)
         assert found["B"]["findings"] == []
 
@@ -554,6 +558,16 @@ class TestCamera:
         status, _, told = run("emva", path, "-o", tmp_path / name, "--force")
         assert status == 1
         assert "ends in none of .html" in told
+
+
+@pytest.mark.parametrize("step", [0.25, 1.0, 3.0])
+def test_bins_of_a_histogram_hold_whole_steps(step):
+    """Each of 32 values stands as often: bins have as many values each, but the last."""
+    axes = new_figure(3, 3).subplots()
+    draw_histogram(axes, Map("Dark", "DN", step * (np.arange(3072.0).reshape(48, 64) % 32) - 7.1))
+    counts = axes.patches[0].get_data().values
+    assert counts.sum() == 3072
+    assert len({*counts[:-1].tolist()}) == 1
 
 
 def test_curves_take_the_colour_of_the_text(results):
@@ -589,7 +603,7 @@ def test_short_forms_are_a_line(results, tmp_path):
     disc = 1000.0 * (np.hypot(rows - 12, cols - 15) < 6)
     band = detector.HgCdTe(start_um=3.0, cutoff_um=5.1)
     manifest = virtual.write(tmp_path / "experiment")
-    camera = equipix.CameraExperiment.load(written_camera(tmp_path, count=6))
+    camera = equipix.CameraExperiment.load(written_camera(tmp_path, count=18, shape=(16, 20)))
     figures = camera.figures()[""]
     (tmp_path / "levels.toml").write_text(
         "".join(f'[[level]]\nframes = "experiment/frames/p{k}.tif"\n' for k in range(2))

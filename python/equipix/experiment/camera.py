@@ -334,7 +334,8 @@ def _of_filters(filters: Filters | None) -> tuple[Finding, ...]:
         return ()
     shown = filters.shown or filters.colours
     rows, cols = shown.period
-    repeats = f"the response repeats every {rows} rows and {cols} columns"
+    periods = [f"{n} {axis}" for n, axis in ((rows, "rows"), (cols, "columns")) if n > 1]
+    repeats = f"the response repeats every {' and '.join(periods)}"
     if filters.shown is not None:
         words = (
             f"{repeats} otherwise than 'cfa' in [sensor], '{filters.colours}', so planes have "
