@@ -323,7 +323,7 @@ def test_averages_and_results_keep_what_their_darks_were_taken_with(tmp_path, ca
     assert settings_of(tmp_path / "master.tif") == Settings(1.0, -9.95)
     assert settings_in(mixed([average] * 2, (0.5, 0.5)).metadata) == Settings(1.0, -9.95)
     path.write_text(path.read_text().replace("dark1.fits", "master.tif"))
-    with pytest.warns(InputWarning, match="dark. was taken with the exposure time 1 s"):
+    with pytest.warns(errors.InputWarning, match="dark. was taken with the exposure time 1 s"):
         known = LevelExperiment.load(path).run(order=0).metadata["dark_settings"]
     assert known == {"exposure_s": 1.0, "temperature_c": -9.95}
 

@@ -24,7 +24,6 @@ from equipix.pictures import new_figure
 from equipix.report.drawing import (
     draw_convergence,
     draw_histogram,
-    draw_histogram,
     draw_map,
     draw_profiles,
     draw_shifts,
