@@ -35,13 +35,13 @@ def emva(
         text = page(camera_parts(loaded.path.parent.resolve().name, planes), "Figures of a camera")
         write_page(output, text, force=force)
     if as_json:
-        result = {
+        of_planes = {
             name: {each.key: each.value for each in figures_of(found)} | told(found.findings)
             for name, found in planes.items()
         }
-        terminal.show_result(
-            {"output": str(output or "none")} | result.get("", result), as_json=True
-        )
+        every = dict.fromkeys(each for found in planes.values() for each in found.findings)
+        result = {"output": output and str(output), **of_planes.get("", of_planes)}
+        terminal.show_result(result, tuple(every), as_json=True)
         return
     rows = zip(*map(figures_of, planes.values()), strict=True)
     terminal.show_table(

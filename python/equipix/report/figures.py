@@ -184,8 +184,14 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
 
 
 def _exposures(calibration: Calibration) -> Iterator[dict[str, Any]]:
-    """Name, shift with its standard deviation where it is known, and flux of each exposure."""
+    """Name, shift with its standard deviation where it is known, and flux of each exposure.
+
+    Unless that of the shift as fitted was found, it is that of the measurement of the shift.
+    """
     shifts, std = calibration.shifts, calibration.shift_std
+    measured = np.array(calibration.metadata.get("measured_shift_std", 0.0))
+    if std is None and measured.any():
+        std = measured
     names = calibration.metadata.get("exposures", range(len(shifts)))
     for number, name in enumerate(names):
         yield {
@@ -307,10 +313,15 @@ FIGURES = {
     "sensitivity_mean": ("mean of M", ""),
     "sensitivity_spread": ("spread of M", ""),
     "sensitivity_std": ("standard deviation of M, median", ""),
-    "sensitivity_std_is_exact_to": ("relative error of that", ""),
+    "sensitivity_std_is_exact_to": ("relative error of these standard deviations", ""),
     "tilt": ("tilt of M, edge to edge", ""),
     "tilt_std": ("standard deviation of the tilt", ""),
-    "error_estimate": ("error of M by the solver", ""),
+    "error_estimate": ("largest error of M by the solver, estimated", ""),
+    "sweeps": ("passes of the solver over the data", ""),
+    "components": ("separate parts of the sensor", ""),
+    "orientation": ("orientation of the shifts", ""),
+    "is_partial": ("determines less than half of the pixels", ""),
+    "dark_frames": ("dark frames subtracted", ""),
     "spatial_variance": ("spatial variance", "DN²"),
     "temporal_variance": ("temporal variance", "DN²"),
     "noise_variances": ("variances of noise", "DN²"),
@@ -329,11 +340,20 @@ _NOTHING = ("none", "not determined")
 def words_of(
     figures: dict[str, Any], without: Collection[str] = ("findings", "exposures")
 ) -> list[tuple[str, str]]:
-    """Names and values of figures in words, some left out."""
+    """Names and values of figures in words, some left out.
+
+    The sign of the shifts is part of what the orientation says in words.
+    """
+    left_out = {*without} | ({"shift_sign"} if "orientation" in figures else set())
     return [
-        (FIGURES.get(key, (key.replace("_", " "), ""))[0], in_words(value, _unit(key)))
+        (
+            FIGURES.get(key, (key.replace("_", " "), ""))[0],
+            "{} rows × {} columns".format(*value)
+            if key == "shape"
+            else in_words(value, _unit(key)),
+        )
         for key, value in figures.items()
-        if key not in without
+        if key not in left_out
     ]
 
 
