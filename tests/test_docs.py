@@ -133,7 +133,7 @@ def test_every_key_has_what_it_must_hold_its_meaning_and_an_example(model):
 def test_the_codes_of_errors_are_those_of_the_readme():
     codes = {code[1:-1] for _, code, _ in table("exit status", "README.md") if "`" in code}
     raised = {getattr(errors, name) for name in errors.__all__ if name.endswith("Error")}
-    assert codes == {each.code for each in raised} | {"usage"}
+    assert codes == {each.code for each in raised} | {"usage", "interrupted"}
 
 
 def test_the_page_describes_every_figure_of_a_camera(tmp_path):

@@ -23,8 +23,8 @@ RECORDS = (Calibration, DynamicCorrection, FrameStatistics, Polynomial, Response
 
 SUFFIXES = (*formats.SUFFIXES, *table.SUFFIXES)
 
-READ = ".tif, .npz, .fits, .nxs, .asdf, .bin, .hex or .h"
-"""What is read, in words: of each format one suffix."""
+READ = f"{formats.SAVED.replace(' or', ',')}, .bin, .hex or .h"
+"""In words, what is read: of each format one suffix."""
 
 _NO_CORRECTIONS = (
     (

@@ -133,14 +133,17 @@ def test_inspect_shows_the_calibration(run, calibration):
     status, out, _ = run("inspect", calibration)
     assert status == 0
     for line in (
-        r"shape +64 × 80",
+        r"shape +64 rows × 80 columns",
         r"converged +yes",
         r"flagged pixels +DO_NOT_USE 8",
         r"\n +p0 .* 1 +\[dark\] *\n",
     ):
         assert re.search(line, out)
-    assert re.search(r"shift sign +undetermined", out)
-    assert re.search(r"orientation +the data do not determine.*compare the axes of the stage", out)
+    # The sign of the shifts is said once, in words that go with "findings none".
+    assert re.search(r"findings +none", out)
+    assert "shift sign" not in out
+    words = "the data do not determine .*, which is no fault; compare the axes of the stage once"
+    assert re.search(rf"orientation of the shifts +{words}", out)
     _, out, _ = run("inspect", calibration, "--json")
     assert json.loads(out)["shift_sign"] == "undetermined"
     told, saved = json.loads(out), equipix.load(calibration)
@@ -148,7 +151,7 @@ def test_inspect_shows_the_calibration(run, calibration):
     assert told["sensitivity_mean"] == pytest.approx(1)
     assert [each["shift"] for each in told["exposures"]] == saved.shifts.tolist()
     assert told["exposures"][0] | {"flux": 1} == {
-        "exposure": "p0", "shift": saved.shifts[0].tolist(), "shift_std": None, "flux": 1,
+        "exposure": "p0", "shift": saved.shifts[0].tolist(), "shift_std": [0, 0], "flux": 1,
         "dark": "[dark]",
     }  # fmt: skip
 
@@ -180,6 +183,23 @@ def test_shifts_are_printed_with_their_standard_deviations(run, tmp_path, count)
         (row, std), (col, _) = (each.split(" ± ") for each in listed[1][1:])
         assert (float(row), float(col)) == pytest.approx(found.shifts[1], abs=5e-5)
         assert float(std) == pytest.approx(found.shift_std[1, 0], abs=5e-5)
+
+
+def test_shifts_measured_by_a_hole_have_the_errors_of_the_measurement(run, tmp_path):
+    shifts = equipix.cross_pattern(2, 3)
+    frames = simulate.exposures(np.ones((20, 16)), simulate.gaussian_beam((20, 16)), shifts)
+    noise = np.random.default_rng(1).standard_normal(frames.shape)
+    found = equipix.calibrate(frames + 1e-3 * noise, shifts)
+    stated = np.full((5, 2), 0.02)
+    stated[0] = 0
+    for std, wanted in ((stated, stated.tolist()), (0 * stated, [None] * 5)):
+        given = found.metadata | {"measured_shift_std": std.tolist()}
+        saved = dataclasses.replace(found, metadata=given)
+        saved.save(tmp_path / "cal.npz", force=True)
+        status, out, _ = run("inspect", tmp_path / "cal.npz", "--json")
+        assert status == 0
+        assert [each["shift_std"] for each in json.loads(out)["exposures"]] == wanted
+        assert ("± 0.0200" in run("inspect", tmp_path / "cal.npz")[1]) == std.any()
 
 
 @pytest.mark.parametrize("weights", ["equal", "variances"])
@@ -306,7 +326,9 @@ def test_json_has_null_for_numbers_that_do_not_exist(capsys):
     }
     terminal.show_result(values, as_json=True)
     out = capsys.readouterr().out
-    assert json.loads(out) == {"a": None, "b": [1.5, [None]], "c": [{"d": None}], "e": "nan"}
+    assert json.loads(out) == {
+        "a": None, "b": [1.5, [None]], "c": [{"d": None}], "e": "nan", "findings": []
+    }  # fmt: skip
     terminal.show_result({"a": np.inf, "b": [1.5, np.nan], "nan": "nan.tif"}, as_json=False)
     said = [line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()]
     assert said == [["a", "not determined"], ["b", "1.5, not determined"], ["nan", "nan.tif"]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import inspect
 import re
 from functools import cache
 from pathlib import Path
@@ -13,6 +14,9 @@ import pytest
 import equipix
 from equipix import cli, simulate
 from equipix.cli.app import COMMANDS, command, in_options
+from equipix.io import formats
+from equipix.saved_results import READ
+from equipix.scene.methods import METHODS
 
 PACKAGE = Path(equipix.__file__).parent
 NAMED = re.compile(r"'([a-z_]+)'|\b([a-z_]+)=(?=['A-Z0-9])")
@@ -151,3 +155,21 @@ def test_the_command_line_says_options(tmp_path, capsys):
     said = capsys.readouterr().err
     assert "--tolerance is 2" in said
     assert "'tolerance'" not in said
+
+
+def test_the_defaults_that_help_states_are_those_of_the_methods():
+    defaults = {}
+    for method in METHODS.values():
+        for name, each in inspect.signature(method).parameters.items():
+            defaults.setdefault(name, set()).add(each.default)
+    options = {each.name: each.help for each in command("scene").params}
+    for name in ("step", "width", "threshold", "motion", "least_motion", "block"):
+        stated = {float(each) for each in re.findall(r"\d[.\d]*", options[name])}
+        assert stated == defaults[name], name
+
+
+def test_the_suffixes_that_help_names_are_one_of_each_format():
+    named = re.findall(r"\.\w+", formats.SAVED)
+    assert {*named} <= {*formats.SUFFIXES}
+    assert {formats._FORMATS[each] for each in named} == {*formats._FORMATS.values()}
+    assert formats.SAVED.replace(" or", ",") in READ

@@ -120,10 +120,10 @@ def calibrate(
         Largest relative error of the sensitivity, against the minimum of the objective, at
         which the solver stops; below 1. The estimate includes errors of the sensor's own size.
     max_sweeps : int, optional
-        Upper limit on passes over the data or its weights; a few more are made where a step is too
-        long. By default there is no limit. The fit also ends where rounding keeps the error
-        estimate from decreasing. Passes that only estimate the error of coordinate descent are not
-        counted.
+        Upper limit on passes over the data or its weights in each fit, of which a calibration may
+        take several; a few more are made where a step is too long. By default there is no limit.
+        The fit also ends where rounding keeps the error estimate from decreasing. Passes that only
+        estimate the error of coordinate descent are not counted.
     uncertainty : bool
         Whether to compute `Calibration.sensitivity_std`, `Calibration.tilt_std` and, for refined
         shifts, `Calibration.shift_std`: the effect of noise and of the priors on fluxes and

@@ -107,7 +107,7 @@ def run(given: list[str]) -> None:
             code = getattr(error, "code", "memory" if isinstance(error, MemoryError) else "file")
             _fail(str(error) or type(error).__name__, code, 1, as_json=as_json)
         except _USAGE as error:
-            if not (words := _of_usage(error)):  # the help is printed: no command is named
+            if not (words := _of_usage(error, given)):  # the help is printed: no command is named
                 raise SystemExit(2) from None
             _fail(words, "usage", 2, as_json=as_json)
     if status == _INTERRUPTED:
@@ -130,14 +130,15 @@ _PLAIN = {
 """What stands in the place of words of typer and of pydantic, which checks for it."""
 
 
-def _of_usage(error: Any) -> str:
+def _of_usage(error: Any, given: list[str]) -> str:
     """Say what is wrong with the usage; nothing where typer has printed the help instead."""
     text = error.format_message()
     for words, plain in _PLAIN.items():
         text = re.sub(words, plain, text)
     if checked := getattr(error.__cause__, "errors", None):
         text = text.replace(": expected", f" is {checked()[0]['input']!r}, expected", 1)
-    place = error.ctx.command_path if error.ctx else f"equipix {CALLED.get().name}"
+    name = next((each for each in given if each in COMMANDS), "")
+    place = error.ctx.command_path if error.ctx else f"equipix {name}"
     CALLED.set(None)  # options are named as they are
     return text and f"{text.rstrip('.')} (see {place} --help)"
 
@@ -206,7 +207,7 @@ def _(
             callback=_log,
             expose_value=False,
             show_default=False,
-            help="Show the steps of the work on stderr; -vv in detail.",
+            help="Show the steps of the work on stderr; -vv shows details.",
         ),
     ] = 0,
 ) -> None: ...

@@ -14,7 +14,7 @@ from equipix.comparison import Comparison
 from equipix.comparison import compare as compare_calibrations
 from equipix.errors import EquipixError, InputError
 from equipix.experiment.experiment import Experiment
-from equipix.io.formats import SUFFIXES
+from equipix.io.formats import SAVED, SUFFIXES
 from equipix.io.paths import refuse_inputs
 from equipix.io.record import read_record
 from equipix.pictures import check_picture, draw_comparison, save_figure
@@ -30,21 +30,26 @@ commands = typer.Typer()
 @commands.command(epilog="Example: equipix calibrate experiment.toml -o cal.tif")
 @terminal.options_of(
     Experiment.run,
-    robust="Leave out measurements that disagree with the others.",
-    method="The solver: the fast one, or the paper's.",
-    flux="Fluxes to find: one an exposure, or linear in the file's times.",
-    tolerance="Largest relative error of the sensitivity.",
-    max_sweeps=typer.Option(min=1, help="Stop after so many sweeps."),
-    uncertainty="Find the standard deviation of every pixel.",
+    robust="Leave out values that disagree with those of the other exposures.",
+    method="Solver: multiscale is fast, coordinate-descent is the paper's and slow.",
+    flux="Fit the fluxes: fit, one for each exposure; linear, a line in the times of the file. "
+    "Unless given, fluxes are those of the file, or equal.",
+    tolerance="Stop where the error of the solver, relative to the sensitivity, is below this.",
+    max_sweeps=typer.Option(
+        min=1, help="Most passes over the data in each fit; a calibration may take several fits."
+    ),
+    uncertainty="Compute the standard deviation of every pixel.",
 )
 def calibrate(
-    experiment: Annotated[Path, typer.Argument(help="The experiment.toml.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Calibration: .tif or .npz.")],
+    experiment: Annotated[
+        Path, typer.Argument(help="The experiment.toml; equipix init writes one.")
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help=f"Calibration: {SAVED}.")],
     mask: terminal.Mask = None,
     partial: Annotated[
         bool,
         typer.Option(
-            "--partial", help="Save a result that determines less than half of the pixels."
+            "--partial", help="Save a result even if it determines less than half of the pixels."
         ),
     ] = False,
     workers: terminal.Workers = None,
@@ -89,7 +94,8 @@ def inspect(
     result = {"file": str(file), **summary(content)}
     if output is not None:
         save_figure(draw_result(content), output, force=force)
-        result["picture"] = str(output)
+    if output is not None or as_json:
+        result["picture"] = output and str(output)
     if as_json and hasattr(content, "metadata"):
         result["metadata"] = content.metadata
     terminal.show_result(result, as_json=as_json)
@@ -98,7 +104,7 @@ def inspect(
 @commands.command(epilog="Example: equipix compare first.tif second.tif -o agreement.png")
 def compare(
     calibrations: Annotated[
-        list[Path], typer.Argument(help="Calibrations of one sensor: .tif or .npz.")
+        list[Path], typer.Argument(help=f"Calibrations of one sensor: {SAVED}.")
     ],
     output: Annotated[
         Path | None,
@@ -149,9 +155,11 @@ def compare(
     ]
     pixels = summary(result)["pixels_compared"]
     if as_json:
-        terminal.show_result({"pixels": pixels, "pairs": pairs}, as_json=True)
+        told = {"output": output and str(output), "pixels": pixels, "pairs": pairs}
+        terminal.show_result(told, as_json=True)
     else:
-        _show_pairs(pairs, result, {"pixels compared": pixels, "output": str(output or "none")})
+        written = {"output": str(output)} if output else {}
+        _show_pairs(pairs, result, written | {"pixels compared": pixels})
     if limits is not None and not as_json:
         terminal.show_limits(judged)
     if check:

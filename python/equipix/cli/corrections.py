@@ -15,7 +15,7 @@ from equipix.correction.polynomial import combine as combine_corrections
 from equipix.errors import InputError
 from equipix.experiment.image_files import sha256_of, with_inputs
 from equipix.findings import Finding, say
-from equipix.io.formats import SUFFIXES
+from equipix.io.formats import SAVED, SUFFIXES
 from equipix.io.paths import find_files, refuse_inputs
 from equipix.io.record import read_record
 from equipix.lens import fit as fit_lens
@@ -36,7 +36,7 @@ _OFFSET = (
 def combine(
     first: Annotated[Path, typer.Argument(help=f"A correction of raw frames: {READ}.")],
     then: Annotated[Path, typer.Argument(help="Offset and gain of frames that it corrected.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="The correction: .tif or .npz.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help=f"The correction: {SAVED}.")],
     force: terminal.Force = False,
     as_json: terminal.Json = False,
 ) -> None:
@@ -54,7 +54,7 @@ def combine(
 )
 def lens(
     frames: Annotated[list[str], typer.Argument(help="Frames of a uniform scene, or an average.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="The gain: .tif or .npz.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help=f"The gain: {SAVED}.")],
     dark: Annotated[
         list[str] | None, typer.Option(help="Dark frames or their average, to be subtracted.")
     ] = None,
@@ -101,7 +101,7 @@ def bolometer(
         str, typer.Option(help="Temperature of the substrate at each state in °C: '0 20 40'.")
     ],
     bias_v: Annotated[str, typer.Option(help="Bias at each state in volts, or one for all.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="The correction: .tif or .npz.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help=f"The correction: {SAVED}.")],
     cold: Annotated[
         list[str] | None, typer.Option(help="A cold black body, a file for each state.")
     ] = None,

@@ -44,16 +44,16 @@ def emva(
         for name, found in planes.items()
     }
     if as_json:
-        result = {
+        of_planes = {
             name: {each.key: each.value for each in figures_of(found)}
             | {"bounds": bounds_of(found)}
             | told(found.findings)
             | ({} if limits is None else {"limits": in_json(checks)})
             for (name, found), checks in zip(planes.items(), judged.values(), strict=True)
         }
-        terminal.show_result(
-            {"output": output and str(output)} | result.get("", result), as_json=True
-        )
+        every = dict.fromkeys(each for found in planes.values() for each in found.findings)
+        result = {"output": output and str(output), **of_planes.get("", of_planes)}
+        terminal.show_result(result, tuple(every), as_json=True)
     else:
         terminal.show_table(("figure", "unit", *planes), rows_of(planes))
         terminal.show_limits(judged)

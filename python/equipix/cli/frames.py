@@ -11,7 +11,7 @@ from equipix.correction.correct_files import correct_files, is_folder
 from equipix.errors import InputError
 from equipix.experiment.image_files import origin_of, refuse_repeated_files, with_inputs
 from equipix.findings import ask, say
-from equipix.io.formats import SUFFIXES
+from equipix.io.formats import SAVED, SUFFIXES
 from equipix.io.paths import find_files, refuse_inputs
 from equipix.measured import statistics
 from equipix.measured.average import average as average_frames
@@ -25,12 +25,15 @@ commands = typer.Typer()
 @commands.command(epilog="Example: equipix average frames/*.png --dark 'dark/*.png' -o mean.tif")
 @terminal.options_of(
     average_frames,
-    saturation="Saturation level in DN; the largest value unless given.",
-    reject="Leave out samples by so many standard deviations: cosmic rays, 5.",
+    saturation="Saturation level in DN. Unless given, the largest value of whole numbers.",
+    reject="Leave out samples that lie more than this many standard deviations off, such as "
+    "cosmic rays; 5 is usual.",
 )
 def average(
-    frames: Annotated[list[str], typer.Argument(help="Image files or globs; or one average.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Statistics: .tif or .npz.")],
+    frames: Annotated[
+        list[str], typer.Argument(help="Image files or globs, or one saved average.")
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help=f"Statistics: {SAVED}.")],
     dark: Annotated[
         list[str] | None, typer.Option(help="Dark frames or their average, to be subtracted.")
     ] = None,

@@ -15,7 +15,7 @@ from equipix.cli import terminal
 from equipix.correction.protocol import Correction, check_sensor, named_cfa
 from equipix.experiment.level_experiment import LevelExperiment
 from equipix.findings import Findings
-from equipix.io.formats import SUFFIXES
+from equipix.io.formats import SAVED, SUFFIXES
 from equipix.io.paths import refuse_inputs
 from equipix.io.record import read_record
 from equipix.measured.colour import Colours
@@ -42,7 +42,7 @@ _ORDERS: dict[str, Order] = {"0": 0, "1": 1, "2": 2, "3": 3, "auto": "auto"}
 @nuc.command(epilog="Example: equipix nuc fit levels.toml -o response.tif --order auto")
 def fit(
     levels: Annotated[Path, typer.Argument(help="The levels.toml.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Response: .tif or .npz.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help=f"Response: {SAVED}.")],
     order: Annotated[
         Literal["0", "1", "2", "3", "auto"],
         typer.Option(help="0 one-point, 1 two-point, 2 quadratic, 3 cubic; or by held-out levels."),
@@ -76,13 +76,13 @@ def fit(
     misfit_limit="Largest deviation of reduced chi2, in sigmas.",
 )
 def defects(
-    response: Annotated[Path, typer.Argument(help="A response: .tif or .npz.")],
+    response: Annotated[Path, typer.Argument(help=f"A response: {SAVED}.")],
     frames: Annotated[
         list[str] | None, typer.Argument(help="Raw frames of one steady level: noise and flicker.")
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="The response with the flags found: .tif or .npz."),
+        typer.Option("--output", "-o", help=f"The response with the flags found: {SAVED}."),
     ] = None,
     cfa: terminal.Cfa = None,
     sensor: terminal.Sensor = None,

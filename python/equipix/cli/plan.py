@@ -20,15 +20,15 @@ commands = typer.Typer()
 
 
 @commands.command(
-    epilog="Example: equipix plan --shape 582 782 --shifts '0,0 0,11 0,19 11,0 19,0' --drift 1e-4. "
-    "To find one: equipix plan --shape 582 782 --exposures 5 --max-shift 80 80"
+    epilog="Example: equipix plan --shape 582 782 --shifts '0,0 0,11 0,19 11,0 19,0' --drift 1e-4"
+    "\n\nTo find a pattern: equipix plan --shape 582 782 --exposures 5 --max-shift 80 80"
 )
 @terminal.options_of(
     suggest,
-    noise="Noise of an exposure, over its signal.",
-    drift="Unknown relative change of the lamp; noise/10 unless given.",
-    shift_error="Error of a shift, in pixels.",
-    beam_width="Width of a Gaussian beam in pixels; even unless given.",
+    noise="Noise of an exposure relative to its signal.",
+    drift="Unknown relative change of the lamp; a tenth of --noise unless given.",
+    shift_error="Standard deviation of a shift, in pixels.",
+    beam_width="Width D in pixels of a Gaussian beam exp(-r²/D²); unless given the beam is even.",
 )
 def plan(
     shape: Annotated[tuple[int, int], typer.Option(min=1, help="Rows and columns of the sensor.")],
@@ -41,7 +41,7 @@ def plan(
     ] = None,
     exposures: Annotated[
         int | None,
-        typer.Option(min=2, help="Exposures of the patterns to find; five unless given."),
+        typer.Option(min=2, help="Number of exposures of the patterns to find; 5 unless given."),
     ] = None,
     cfa: terminal.Cfa = None,
     rng: terminal.Seed = 0,
@@ -76,8 +76,9 @@ def plan(
     budgets = [replace(each, findings=said + each.findings) for each in budgets]
     plans = [_plan_summary(budget, cfa) for budget in budgets]
     if as_json:
-        result = {"shape": list(shape), "patterns": plans}
-        terminal.show_result(result | ({"picture": str(output)} if output else {}), as_json=True)
+        result = {"picture": output and str(output), "shape": list(shape), "patterns": plans}
+        every = dict.fromkeys(each for budget in budgets for each in budget.findings)
+        terminal.show_result(result, tuple(every), as_json=True)
     else:
         _show_plans(plans)
 

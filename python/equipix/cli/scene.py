@@ -10,7 +10,7 @@ import typer
 from equipix.cli import terminal
 from equipix.errors import FileError, InputError
 from equipix.experiment.image_files import sha256_of, with_inputs
-from equipix.io.formats import SUFFIXES, raw_header
+from equipix.io.formats import SAVED, SUFFIXES, raw_header
 from equipix.io.paths import find_files, refuse_inputs
 from equipix.io.record import read_record
 from equipix.pictures import check_picture, draw_sequence, save_figure
@@ -30,45 +30,55 @@ _TIFF = (".tif", ".tiff")
 @commands.command(epilog="Example: equipix scene frames/*.tif -o nuc.tif --method registered")
 @terminal.options_of(
     *METHODS.values(),
-    saturation="Raw value from which a pixel is saturated; that of whole numbers.",
-    step="Step of local-mean, gated and registered.",
-    width="Neighbourhood of gated, constant-statistics and kalman.",
-    threshold="Change of the local mean from which gated learns.",
-    motion="Change from which constant-statistics and kalman take a frame.",
-    least_motion="Shift in pixels from which registered takes a pair.",
-    block="Moving frames of a block of kalman.",
+    saturation="Raw value in DN from which a pixel is saturated; unless given, the largest of "
+    "whole numbers.",
+    step="Step of learning of local-mean (0.025 unless given), gated (0.06), registered (0.1).",
+    width="Side in pixels of the neighbourhood of gated (11 unless given), constant-statistics and "
+    "kalman (21).",
+    threshold="Change of the local mean, relative to the range, from which gated learns; 0.02 "
+    "unless given.",
+    motion="Change, relative to the range, from which constant-statistics and kalman take a frame; "
+    "0.004 unless given.",
+    least_motion="Shift in pixels from which registered takes a pair of frames; 0.5 unless given.",
+    block="Number of moving frames of a block of kalman; 50 unless given.",
 )
 def scene(
     frames: Annotated[
         list[str],
-        typer.Argument(help="Raw frames in order: image files or globs, many pages each."),
+        typer.Argument(help="Raw frames in their order in time: image files or globs."),
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="The correction: .tif or .npz.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help=f"The correction: {SAVED}.")],
     method: Annotated[
         Literal["local-mean", "gated", "registered", "constant-statistics", "kalman"],
         typer.Option(help="How gain and offset follow from the frames."),
     ] = "registered",
     data_range: Annotated[
         tuple[float, float] | None,
-        typer.Option(help="Lowest and highest raw value in DN; that of whole numbers by default."),
+        typer.Option(
+            help="Lowest and highest raw value in DN; unless given, the range of whole numbers."
+        ),
     ] = None,
     bit_depth: Annotated[
         int | None,
-        typer.Option(min=1, max=16, help="Bits of the raw values: --data-range of 0 up."),
+        typer.Option(min=1, max=16, help="Bits of the raw values, in the place of --data-range."),
     ] = None,
     mask: terminal.Mask = None,
     corrected: Annotated[
         Path | None,
-        typer.Option(help="A .tif of all frames, each corrected by what was learned before it."),
+        typer.Option(
+            help="Also write all frames, each corrected by what was learned before it: .tif."
+        ),
     ] = None,
     picture: Annotated[
         Path | None,
-        typer.Option(help="A frame before and after, and the roughness: .png, .pdf or .svg."),
+        typer.Option(
+            help="Draw a frame before and after, and the roughness over time: .png, .pdf or .svg."
+        ),
     ] = None,
     state: Annotated[
-        Path | None, typer.Option(help="Save the state, so that --resume goes on: .tif or .npz.")
+        Path | None, typer.Option(help=f"Also save the state of learning, for --resume: {SAVED}.")
     ] = None,
-    resume: Annotated[Path | None, typer.Option(help="A saved state to go on from.")] = None,
+    resume: Annotated[Path | None, typer.Option(help="Go on learning from a saved state.")] = None,
     workers: terminal.Workers = None,
     force: terminal.Force = False,
     as_json: terminal.Json = False,

@@ -17,9 +17,9 @@ commands = typer.Typer()
 
 @commands.command(epilog="Example: equipix simulate --shape 240 320 --frames 20 -o experiment")
 def simulate(
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to make.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The folder to write.")],
     shape: terminal.Shape = (240, 320),
-    frames: Annotated[int, typer.Option(min=1, help="Frames of an exposure.")] = 20,
+    frames: Annotated[int, typer.Option(min=1, help="Number of frames of each exposure.")] = 20,
     bit_depth: Annotated[int, typer.Option(min=8, max=16, help="Bits of the ADC.")] = 12,
     cfa: terminal.Cfa = None,
     rng: terminal.Seed = 0,
@@ -40,11 +40,11 @@ def demo(
         Path, typer.Option("--output", "-o", help="The picture: .png, .pdf or .svg.")
     ] = Path("equipix-demo.png"),
     shape: terminal.Shape = (582, 782),
-    frames: Annotated[int, typer.Option(min=2, help="Frames of an exposure.")] = 40,
+    frames: Annotated[int, typer.Option(min=2, help="Number of frames of each exposure.")] = 40,
     rng: terminal.Seed = 1,
     keep: Annotated[
         Path | None,
-        typer.Option(help="Folder to make for the images; without it they are removed."),
+        typer.Option(help="A folder for the simulated images; unless given they are removed."),
     ] = None,
     workers: terminal.Workers = None,
     force: terminal.Force = False,

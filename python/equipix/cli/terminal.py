@@ -76,9 +76,13 @@ def _announcer() -> Progress:
 
 
 def show_result(result: dict[str, Any], found: Findings | None = None, *, as_json: bool) -> None:
-    """Print a result as one JSON object or as a table, with its findings where it can have any."""
+    """Print a result as one JSON object or as a table, with its findings where it can have any.
+
+    The object has a list of findings in any case.
+    """
     result = result if found is None else result | told(found, as_json=as_json)
     if as_json:
+        result = told(()) | result
         # JSON has no NaN and no infinity: null is what is not determined.
         print(json.dumps(json.loads(json.dumps(result), parse_constant=lambda _: None)))  # noqa: T201
         return
@@ -235,9 +239,12 @@ def options_of(
     return declared
 
 
-Force = Annotated[bool, typer.Option("--force", help="Replace an existing output.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace an output that exists.")]
 
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+Json = Annotated[
+    bool,
+    typer.Option("--json", help="Print the result as one JSON object; an error too, on stderr."),
+]
 
 Limits = Annotated[
     Path | None,
@@ -249,34 +256,37 @@ Check = Annotated[
     typer.Option("--check", help="End with status 1 where one fails, or nothing is judged."),
 ]
 
-Workers = Annotated[int | None, typer.Option(min=1, help="Threads; all processors unless given.")]
+Workers = Annotated[
+    int | None, typer.Option(min=1, help="Number of threads; one for each processor unless given.")
+]
 
 Mask = Annotated[
-    Path | None, typer.Option(help="An image or .npy: pixels that are not 0 in it are not used.")
+    Path | None,
+    typer.Option(help="An image or .npy file: pixels that are not 0 in it are left out."),
 ]
 
 Cfa = Annotated[
     str | None,
     typer.Option(
-        help="Colour filters of the pixels: RGGB, GRBG, GBRG or BGGR, or the rows of one period, "
-        "such as RRGG/RRGG/GGBB/GGBB, or RGB/ of one row."
+        help="Colour filters of the pixels: RGGB, GRBG, GBRG or BGGR, or the rows of one period "
+        "with / between them, such as RRGG/RRGG/GGBB/GGBB; RGB/ has a period of one row."
     ),
 ]
 
 Sensor = Annotated[
     str | None,
     typer.Option(
-        help="Name of the sensor that gave the frames: another than the file's is refused."
+        help="Name of the sensor that took the frames: a correction of another one is refused."
     ),
 ]
 
 
 Picture = Annotated[
-    Path | None, typer.Option("--output", "-o", help="A picture: .png, .pdf or .svg.")
+    Path | None, typer.Option("--output", "-o", help="A picture to draw: .png, .pdf or .svg.")
 ]
 
 Seed = Annotated[int, typer.Option("--rng", min=0, help="Seed of the random numbers.")]
 
 Shape = Annotated[
-    tuple[int, int], typer.Option(min=48, help="Rows and columns of the sensor, 48 or more.")
+    tuple[int, int], typer.Option(min=48, help="Rows and columns of the sensor, each 48 or more.")
 ]

@@ -36,7 +36,12 @@ _ROUNDS = 4
 
 AS_GIVEN = Orientation()
 
-_QUESTIONS = {"rows": "rows", "cols": "columns", "exchanged": "order of axes", "turned": "turns"}
+_QUESTIONS = {
+    "rows": "the sign along rows",
+    "cols": "the sign along columns",
+    "exchanged": "the order of the axes",
+    "turned": "the direction of turns",
+}
 
 _REMEDY = (
     "compare the axes of the stage once with the figure in docs/shifts.md, or put an object with "
@@ -100,8 +105,8 @@ class OrientationTest(Brief):
         if self.sign == "contradicted":
             return f"the data contradict the orientation of the shifts: {self.best.words}"
         known = {name: getattr(self, name) for name in _QUESTIONS if name != "turned"}
-        told = [f"{_QUESTIONS[name]} {it}" for name, it in known.items() if it != "undetermined"]
-        parts = f" ({', '.join(told)})" if told else ""
+        told = [_QUESTIONS[name] for name, it in known.items() if it == "confirmed"]
+        parts = f" (they do confirm {' and '.join(told)})" if told else ""
         if self.is_likely and self.hidden is not None:
             return f"the orientation of the shifts is probably wrong: {self.hidden.words}"
         return f"the data do not determine the orientation of the shifts{parts}: {self.reason}"
@@ -286,7 +291,10 @@ def _answer(left: set[Orientation], name: str) -> ShiftSign:
 def _reason(low: WindowFit, left: set[Orientation], best: Orientation) -> str:
     if low.is_white:
         also = next(way.changes for way in left if way != AS_GIVEN)
-        return f"the data fit equally well with {also}, since the beam is too smooth; {_REMEDY}"
+        return (
+            f"the data fit equally well with {also}, since the beam is smooth, which is no fault; "
+            f"{_REMEDY}"
+        )
     return (
         f"in the best orientation ('{best.words}') residuals of neighbours are still correlated by "
         f"{max(abs(each.size) for each in low.neighbours):.0%}: look for another cause, such as "

@@ -132,7 +132,7 @@ class Experiment(Described[Manifest]):
         tolerance : float
             Largest relative error of the sensitivity at which the solver stops.
         max_sweeps : int, optional
-            Upper limit on passes over the data.
+            Upper limit on passes over the data in each fit.
         uncertainty : bool
             Whether to find the standard deviation of every pixel and of the tilt.
         workers : int, optional

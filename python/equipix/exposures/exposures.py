@@ -54,7 +54,7 @@ class FitOptions:
     tolerance : float
         Largest relative error of the sensitivity at which the solver stops.
     max_sweeps : int or None
-        Upper limit on passes over the data or its weights.
+        Upper limit on passes over the data or its weights in a fit.
     workers : int or None
         Number of threads; None: as many as processors may be used.
     progress : callable or None

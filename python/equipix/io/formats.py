@@ -65,6 +65,9 @@ _DESCRIPTIONS = {
 
 SUFFIXES = tuple(_FORMATS)
 
+SAVED = ".tif, .npz, .fits, .nxs or .asdf"
+"""In words, what results are saved as: of each format one suffix."""
+
 ONLY_RESULTS = (".npz", *asdf.SUFFIXES)
 """Suffixes of files that hold results and no frames."""
 
@@ -151,9 +154,7 @@ def load_pages(path: str | PathLike[str]) -> tuple[dict[str, Array], dict[str, A
 
 def _format(path: Path) -> tuple[Callable[..., None], Callable[[Path], _Content]]:
     if path.suffix.lower() not in _FORMATS:
-        raise InputError(
-            f"{path}: ends in '{path.suffix}', expected the suffix .tif, .npz, .fits, .nxs or .asdf"
-        )
+        raise InputError(f"{path}: ends in '{path.suffix}', expected the suffix {SAVED}")
     return _FORMATS[path.suffix.lower()]
 
 

@@ -225,8 +225,14 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
 
 
 def _exposures(calibration: Calibration) -> Iterator[dict[str, Any]]:
-    """Name, shift with its standard deviation where it is known, and flux of each exposure."""
+    """Name, shift with its standard deviation where it is known, and flux of each exposure.
+
+    Unless that of the shift as fitted was found, it is that of the measurement of the shift.
+    """
     shifts, std = calibration.shifts, calibration.shift_std
+    measured = np.array(calibration.metadata.get("measured_shift_std", 0.0))
+    if std is None and measured.any():
+        std = measured
     names = calibration.metadata.get("exposures", range(len(shifts)))
     darks = calibration.metadata.get("darks", [""] * len(shifts))
     for number, name in enumerate(names):
@@ -376,6 +382,11 @@ FIGURES = {
     "th": ("columns and time th", ""),
     "vh": ("pixels vh", ""),
     "tvh": ("pixels and time tvh", ""),
+    "sweeps": ("passes of the solver over the data", ""),
+    "components": ("separate parts of the sensor", ""),
+    "orientation": ("orientation of the shifts", ""),
+    "is_partial": ("determines less than half of the pixels", ""),
+    "dark_frames": ("dark frames subtracted", ""),
     "spatial_variance": ("spatial variance", "DN²"),
     "temporal_variance": ("temporal variance", "DN²"),
     "noise_variances": ("variances of noise", "DN²"),
@@ -397,11 +408,20 @@ _NOTHING = ("none", "not determined")
 def words_of(
     figures: dict[str, Any], without: Collection[str] = ("findings", "exposures")
 ) -> list[tuple[str, str]]:
-    """Names and values of figures in words, some left out."""
+    """Names and values of figures in words, some left out.
+
+    The sign of the shifts is part of what the orientation says in words.
+    """
+    left_out = {*without} | ({"shift_sign"} if "orientation" in figures else set())
     return [
-        (FIGURES.get(key, (key.replace("_", " "), ""))[0], in_words(value, _unit(key)))
+        (
+            FIGURES.get(key, (key.replace("_", " "), ""))[0],
+            "{} rows × {} columns".format(*value)
+            if key == "shape"
+            else in_words(value, _unit(key)),
+        )
         for key, value in figures.items()
-        if key not in without
+        if key not in left_out
     ]
 
 
