@@ -539,7 +539,7 @@ class TestCamera:
         assert text.count("<h3>Planes side by side</h3>") == 1
         assert printed.endswith(f"output  {out}\n")
         found = json.loads(run("emva", path, "--json")[1])
-        assert [*found] == ["output", "R", "G1", "G2", "B"]
+        assert {*found} == {"findings", "output", "R", "G1", "G2", "B"}
         assert found["output"] is None
         assert found["R"]["gain_dn_per_e"] == pytest.approx(0.25, rel=0.2)
         assert found["B"]["findings"] == []

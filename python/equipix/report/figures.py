@@ -357,8 +357,6 @@ FIGURES = {
     "substrate_c": ("temperature of the substrate", "°C"),
     "bias_v": ("bias", "V"),
     "reduced_chi2": ("reduced χ²", ""),
-    "sweeps": ("passes over the data", ""),
-    "dark_frames": ("frames of the dark that belongs to it", ""),
     "colour_response": ("mean response of each colour (M has mean 1 within each)", ""),
     "sensitivity_mean": ("mean of M", ""),
     "sensitivity_spread": ("spread of M", ""),
