@@ -116,8 +116,8 @@ def test_is_refused_by_the_name_of_the_argument(function, wrong):
         try:
             function(**CALLS[function] | {name: WRONG[wrong]})
         except errors.InputError as error:
-            # Of two that must fit together the message names the second.
-            others = {"times": "'ratios'"}
+            # Of two that must fit together the message names the second, of a pair the part.
+            others = {"times": "'ratios'", "black_bodies": "'cold'"}
             assert f"'{name}" in str(error) or others.get(name, "''") in str(error)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import html
 import json
 import re
@@ -13,7 +14,7 @@ import pytest
 
 import equipix
 from equipix import cli, errors, simulate
-from equipix.comparison import _student_quantile
+from equipix.comparison import Check, _student_quantile, _verdict
 from equipix.pictures import draw_comparison
 
 SHAPE = (96, 128)
@@ -172,6 +173,9 @@ def test_bad_arguments_are_named(experiments):
         equipix.compare(calibrations, predicted=np.ones((2, 2)))
     with pytest.raises(errors.InputError, match=r"'predicted' has shape \(3, 1\)"):
         equipix.compare(calibrations, predicted=np.ones((3, 1)))
+    for wrong in (0, -1e-3, np.nan, np.inf):
+        with pytest.raises(errors.InputError, match="'predicted' is .* finite numbers above 0"):
+            equipix.compare(calibrations, predicted=[[1e-3, 1e-4], [1e-3, wrong], [1e-3, 1e-4]])
     shape, shifts = (40, 50), equipix.cross_pattern(5, 7)
     frames = simulate.exposures(np.ones(shape), simulate.gaussian_beam(shape), shifts)
     small = equipix.calibrate(frames, shifts)
@@ -280,9 +284,9 @@ def test_errors_of_one_experiment_are_seen(draws, figure, wrong, what):
     assert seen == len(seeds)
 
 
-def test_the_verdict_has_a_rule(tmp_path):
+def test_the_verdict_has_a_rule(alike, tmp_path):
     """Limits of the rms follow from the degrees of freedom, those of tilts from their law."""
-    pair = [measured(1, 4), measured(2, 5)]
+    pair = alike
     pixels, *tilts, blocks = equipix.compare(pair).checks[0]
     assert [each.what for each in tilts] == ["tilt along rows", "tilt along columns"]
     # Four checks share 1 %: normal for both sides of a tilt; the map is exact to 2 %.
@@ -302,12 +306,146 @@ def test_the_verdict_has_a_rule(tmp_path):
     assert len(repr(same)) <= 120
 
 
+def test_a_check_passes_within_its_limits_alone():
+    ratios = {0.9: False, 0.95: True, 1.05: True, 1.1: False, np.nan: False, np.inf: False}
+    for ratio, passed in ratios.items():
+        assert Check("it", ratio * 2e-3, 2e-3, 0.95, 1.05).passed is passed
+    agreement = [_verdict((Check("it", ratio, 1, 0.95, 1.05),)) for ratio in ratios]
+    assert [each.startswith("agree within") for each in agreement] == [*ratios.values()]
+
+
+@pytest.fixture(scope="module")
+def alike():
+    """A pair with error bars that agrees."""
+    return [measured(1, 4), measured(2, 5)]
+
+
+def test_errors_of_the_solver_are_no_difference(alike):
+    """Of each the estimate counts once: at the upper limits, in pixels, tilts and blocks."""
+    first, second = alike
+    plain = equipix.compare(alike).checks[0]
+    coarse = dataclasses.replace(first, error_estimate=3e-3)
+    found = equipix.compare([coarse, second]).checks[0]
+    assert len(found) == 4
+    for each, was in zip(found, plain, strict=True):
+        assert each.predicted == pytest.approx(np.hypot(was.predicted, 3e-3), rel=1e-4)
+        assert each.high == pytest.approx(was.high, rel=1e-9)
+        # A solver that left nothing of it is not too good.
+        assert each.low * each.predicted == pytest.approx(was.low * was.predicted, rel=1e-9)
+
+
+def test_a_drift_in_error_bars_widens_the_tilt_alone(alike):
+    """Student's t with its degrees of freedom; block means, which it tilts, are not judged."""
+    first, second = alike
+    tilt = np.array([3e-3, 4e-3])
+    drift = dataclasses.replace(
+        first.drift,
+        size=1e-3,
+        degrees_of_freedom=2,
+        slope_covariance=np.diag((tilt / SMALL) ** 2),
+        tilt_std=tilt,
+    )
+    was = dataclasses.replace(first.drift, size=0.0, tilt_std=np.zeros(2))
+    hidden = first.sensitivity * np.sqrt(drift.variance_map(first.sensitivity))
+    pair = [
+        dataclasses.replace(
+            first,
+            drift=drift,
+            sensitivity_std=np.hypot(first.sensitivity_std, hidden),
+            tilt_std=np.hypot(first.tilt_std, tilt),
+        ),
+        dataclasses.replace(second, drift=None),
+    ]
+    plain, *_ = equipix.compare([dataclasses.replace(first, drift=was), pair[1]]).checks[0]
+    pixels, *tilts = equipix.compare(pair).checks[0]
+    assert [each.what for each in tilts] == ["tilt along rows", "tilt along columns"]
+    for axis, each in enumerate(tilts):
+        assert each.high == pytest.approx(_student_quantile(1 - 0.01 / 3 / 2, 2), rel=1e-9)
+        std = np.sqrt(sum(c.tilt_std[axis] ** 2 + c.error_estimate**2 for c in pair))
+        assert each.predicted == pytest.approx(std, rel=1e-9)
+    # The pixels' part is without it, to the rounding of float32 error bars.
+    assert pixels.predicted == pytest.approx(plain.predicted, rel=1e-3)
+
+
+def test_error_bars_that_are_inexact_or_uneven_widen_the_limits(alike):
+    exactness = alike[0].metadata["uncertainty"]["relative_standard_error"]
+    plain = equipix.compare(alike).checks[0][0]
+    inexact = [
+        dataclasses.replace(
+            each, metadata={**each.metadata, "uncertainty": {"relative_standard_error": 0.1}}
+        )
+        for each in alike
+    ]
+    sigmas = NormalDist().inv_cdf(1 - 0.0025 / 2)
+    high = equipix.compare(inexact).checks[0][0].high
+    assert high == pytest.approx(1 + sigmas * 0.1, rel=0.1)  # of second order: (3 · 0.1)²
+    uneven = []
+    for each in alike:
+        std = each.sensitivity_std.copy()
+        std[:, : SMALL[1] // 8] *= 8
+        uneven.append(dataclasses.replace(each, sensitivity_std=std))
+    found = equipix.compare(uneven).checks[0][0]
+    # An eighth of the pixels has 64 times the variance of the others: few count.
+    shares = np.array([64, *[1] * 7])
+    evenness = shares.mean() ** 2 / np.mean(shares**2)
+    scatters = [np.hypot(exactness, (2 * TRUTH.size * e) ** -0.5) for e in (1, evenness)]
+    ratio = (found.high - 1) / (plain.high - 1)
+    assert ratio == pytest.approx(scatters[1] / scatters[0], rel=0.15)
+
+
+def test_a_pixel_far_out_is_no_tilt(alike):
+    """M at a corner three times as large counts for no slope of ln M."""
+    first, second = alike
+    sensitivity = first.sensitivity.copy()
+    sensitivity[0, 0] *= 3
+    changed = dataclasses.replace(first, sensitivity=sensitivity)
+    for was, now in zip(
+        equipix.compare(alike).checks[0][1:3],
+        equipix.compare([changed, second]).checks[0][1:3],
+        strict=True,
+    ):
+        # A corner's weight is 6/3072, and its noise 8e-4.
+        assert now.found == pytest.approx(was.found, abs=4 * 8e-4 * 6 / 3072)
+
+
+def test_maps_without_standard_deviations_are_not_judged(alike):
+    first, second = alike
+    for change in ({"sensitivity_std": 0 * first.sensitivity_std}, {"error_estimate": np.inf}):
+        result = equipix.compare([dataclasses.replace(first, **change), second])
+        assert result.checks == ((),)
+        assert result.verdicts[0].startswith("not judged")
+
+
 @pytest.mark.parametrize(
     ("freedom", "quantile"), [(0, 2.5758), (1, 63.657), (2, 9.9248), (6, 3.7074), (30, 2.7500)]
 )
 def test_quantiles_are_those_of_tables(freedom, quantile):
     """Of Student's t at 0.995; of the normal distribution for a freedom of 0."""
     assert _student_quantile(0.995, freedom) == pytest.approx(quantile, rel=2e-5)
+
+
+def check_pairs(files, limits, run):
+    """What --check says of a pair that agrees, of one that differs, and of one without bars."""
+    assert run("compare", *files[:2], "--check")[0] == 0
+    status, _, told = run("compare", *files[:3], "--check")
+    assert status == 1
+    assert re.search(
+        r"tilted\.tif: tilt along columns, over predicted is \d+.*, expected 0 to", told
+    )
+    assert f"{files[0]} − {files[1]}" not in told
+    status, _, told = run("compare", files[0], files[3], "--check")
+    assert status == 1
+    assert "nothing is judged of" in told
+    assert "--uncertainty" in told
+    limits.write_text("[comparison]\nrms = 1e-6\nlargest = 1\n")
+    asked = ("compare", *files[:2], "--limits", limits, "--check")
+    status, printed, told = run(*asked)
+    assert status == 1
+    assert re.search("rms is .*, expected at most 1e-06", told)
+    assert re.search("PASS .*other.tif: largest ", printed)
+    (pair,) = json.loads(run(*asked, "--json")[1])["pairs"]
+    assert [each["passed"] for each in pair["checks"]] == [True] * 3
+    assert [each["verdict"] for each in pair["limits"]][-2:] == ["FAIL", "PASS"]
 
 
 def test_a_page_and_words_have_the_verdict(tmp_path, run):
@@ -338,6 +476,10 @@ def test_a_page_and_words_have_the_verdict(tmp_path, run):
     assert found["pairs"][0]["verdict"].startswith("not judged: no standard deviations")
     assert found["pairs"][0]["checks"] == []
     assert run("compare", *files[:2], "-o", tmp_path / "page.htm")[0] == 1
+    # The page has the content of its files, and what failed.
+    assert hashlib.sha256(files[2].read_bytes()).hexdigest() in text
+    assert text.count("None: nothing contradicts the result.") == 1
+    check_pairs(files, tmp_path / "limits.toml", run)
     result = equipix.compare(calibrations[:2])
     assert len(result.plot().axes) > 5
     assert "agree within their noise" in result._repr_html_()

@@ -62,6 +62,26 @@ class TestFit:
         # linear in its parameters where their errors are small.
         assert np.sqrt(np.mean(np.square(z))) == pytest.approx(1, abs=0.36)
 
+    @pytest.mark.parametrize("law", ["cos4", "radial"])
+    def test_every_standard_error_is_that_of_repeated_flats(self, law):
+        rng, shape, centre = np.random.default_rng(7), (24, 64), (10.0, 35.0)
+        exact = lens.cos4(squared(shape, centre), 60.0)
+        if law == "radial":
+            exact = 1 - 0.4 * (rho := squared(shape, centre) / (24**2 + 64**2) * 4) + 0.1 * rho**2
+        z = []
+        for _ in range(40):
+            found = lens.fit(1000 * exact + 10 * rng.standard_normal(shape), law=law)
+            away = {"row": found.centre[0] - 10, "col": found.centre[1] - 35}
+            away["focal_length"] = found.focal_length - 60
+            for name, value, true in zip(
+                ("k1", "k2"), found.coefficients, (-0.4, 0.1), strict=False
+            ):
+                away[name] = value - true
+            z.append([away[name] / error for name, error in found.std.items()])
+        # Four standard errors of an rms of 40.
+        rms = np.sqrt(np.mean(np.square(z), axis=0))
+        np.testing.assert_allclose(rms, 1, atol=4 / np.sqrt(2 * 40))
+
     def test_the_sensors_own_gain_can_be_given(self):
         sensitivity = simulate.cosine_sensitivity(SHAPE, rng=3)
         biased = lens.fit(1000 * cos4(squared(), FOCAL) * sensitivity)
@@ -257,7 +277,7 @@ class TestCombine:
         loaded = equipix.load(tmp_path / "both.npz")
         np.testing.assert_array_equal(loaded.flags, flags)
         np.testing.assert_array_equal(loaded.coefficients, both.coefficients)
-        assert "order 3" in repr(loaded)
+        assert "degree 3" in repr(loaded)
         assert equipix.Corrector(loaded).replaced == 1
 
     @pytest.mark.parametrize("order", [0, 1, 2])
@@ -335,7 +355,7 @@ class TestCombine:
 
     def test_what_does_not_combine_is_refused(self):
         response = nuc.fit(self.levels(), order=2)
-        with pytest.raises(errors.InputError, match="'then' has order 3"):
+        with pytest.raises(errors.InputError, match="'then' has degree 3"):
             equipix.combine(response, response)
         line = response.coefficients[:2]
         one, other = (

@@ -380,7 +380,7 @@ class Words(NamedTuple):
 
     def place(self, number: int, name: str = "") -> str:
         """Name one of the measurements."""
-        return f"{self.argument}: {self.one} {number}{f' ({name!r})' if name else ''}"
+        return f"{self.argument}: {self.one} {repr(name) if name else number}"
 
 
 EXPOSURES = Words()

@@ -44,6 +44,11 @@ class Check(NamedTuple):
         """Found over predicted."""
         return self.found / self.predicted
 
+    @property
+    def passed(self) -> bool:
+        """Whether the ratio lies within its limits."""
+        return self.low <= self.times <= self.high
+
 
 @dataclass(frozen=True, eq=False)
 class Comparison(Brief, Shown):
@@ -111,7 +116,8 @@ def compare(
         Of each calibration the root mean square of its relative error that is expected in single
         pixels and in means over blocks of 16×16, as `equipix.simulate.noise_prediction` gives.
         Unless given it is computed from `sensitivity_std` where all have one; that of the blocks
-        by `Calibration.std_of` of 16 of them, where none was read from a file.
+        by `Calibration.std_of` of 16 of them, where none was read from a file. Where one has
+        none above 0, or its solver failed, nothing is judged.
 
     Returns
     -------
@@ -122,7 +128,8 @@ def compare(
     ------
     InputError
         If there are fewer than two calibrations, of different shapes, without a common good
-        pixel, or smaller than a block of 16×16 pixels.
+        pixel, or smaller than a block of 16×16 pixels; or if what is `predicted` is not finite
+        and above 0.
 
     Notes
     -----
@@ -132,16 +139,16 @@ def compare(
     left out (`Comparison.open_tilt`).
 
     `Comparison.verdicts` judges each pair. Found over predicted must lie between limits that noise
-    alone crosses in at most 1 % of the pairs; each check has an even share of it:
+    alone crosses in at most 1 % of the pairs; each check has an even share of it. The estimated
+    errors of both solvers are part of what is predicted, in quadrature, and of the upper limits.
 
     - The rms over pixels, without the tilt. Its square over the predicted one follows Fisher's
       distribution. Errors of waves of M have variances 1/λ(q) (`equipix.plan.error_budget`), so
       the found one has (Σ 1/λ)²/Σ 1/λ² degrees of freedom. Error bars with a relative standard
       error e (``metadata["uncertainty"]``) have 1/(2e²). Both calibrations are taken to have waves
       and draws in common, which widens the limits.
-    - The tilt along rows and along columns, over `tilt_std` and the solver errors of both, by the
-      normal distribution. Where the drift of a lamp is part of `tilt_std`, by Student's t with its
-      degrees of freedom.
+    - The tilt along rows and along columns, over `tilt_std` of both, by the normal distribution.
+      Where the drift of a lamp is part of `tilt_std`, by Student's t with its degrees of freedom.
     - The rms of block means, upwards, where it is predicted and no drift of a lamp is part of it.
       That of 16 blocks has 16 degrees of freedom; that of `predicted` counts as exact.
 
@@ -186,8 +193,7 @@ def compare(
     compared = sensitivities
     if is_open.any():
         compared = np.stack([_levelled(each, sensitivities[0]) for each in sensitivities])
-    expected = _expected(calibrations) if predicted is None else predicted
-    predictions = _predictions(expected, pairs, count)
+    expected = _expected(calibrations) if predicted is None else _told(predicted, count)
     return Comparison(
         sensitivities=sensitivities,
         agreement=compared.std(axis=0, ddof=1),
@@ -203,12 +209,12 @@ def compare(
                 [calibrations[k] for k in pair],
                 sensitivities[pair],
                 differences[number],
-                np.square(np.asarray(expected, np.float64)[pair]),
+                np.square(expected[pair]),
                 told=predicted is not None,
             )
             for number, pair in enumerate(pairs)
         ),
-        **predictions,
+        **_predictions(expected, pairs),
     )
 
 
@@ -218,7 +224,7 @@ def _verdict(checks: tuple[Check, ...]) -> str:
         return "not judged: no standard deviations (calibrate with --uncertainty)"
     for words, failed in (
         ("differ by more than their noise", [c for c in checks if c.times > c.high]),
-        ("agree better than their noise", [c for c in checks if c.times < c.low]),
+        ("agree better than their noise", [c for c in checks if not c.passed]),
     ):
         if failed:
             told = (
@@ -238,34 +244,37 @@ def _checks(
     """
     drifts = [c.drift.degrees_of_freedom for c in pair if c.drift is not None and c.drift.is_added]
     tilts = np.square([np.zeros(2) if c.tilt_std is None else c.tilt_std for c in pair])
-    judged = np.flatnonzero((np.isfinite(tilts) & (tilts > 0)).all(axis=0))
+    pixels = difference if told else _difference(maps[0], maps[1], True)
+    count = [slope_pixels(each.sensitivity, each.flags) for each in pair]
+    slopes = np.abs(tilt(maps[0] / maps[1], np.isfinite(pixels) & count[0] & count[1]))
+    judged = np.flatnonzero((np.isfinite(tilts) & (tilts > 0)).all(axis=0) & np.isfinite(slopes))
     blocks = bool(np.isfinite(variances[:, 1]).all()) and not drifts
     tail = _FALSE / (1 + len(judged) + blocks)
-    evenness, exactness, predicted, pixels = 1.0, _EXACT, variances[:, 0], difference
+    evenness, exactness, predicted = 1.0, _EXACT, variances[:, 0]
     if not told:
-        pixels = _difference(maps[0], maps[1], True)
         predicted, exactness, evenness = _of_bars(pair, np.isfinite(pixels))
     found = evenness * _freedom(pair, predicted, without_tilt=not told)
-    limits = (fisher_quantile(p, found, 0.5 / exactness**2) for p in (tail / 2, 1 - tail / 2))
+    low, high = (
+        fisher_quantile(p, found, 0.5 / exactness**2) ** 0.5 for p in (tail / 2, 1 - tail / 2)
+    )
     what = "pixels, rms" if told else "pixels without tilt, rms"
-    checks = [
-        Check(what, rms(pixels), float(predicted.sum()) ** 0.5, *(each**0.5 for each in limits))
-    ]
-    if len(judged):
-        count = [slope_pixels(each.sensitivity, each.flags) for each in pair]
-        slopes = np.abs(tilt(maps[0] / maps[1], np.isfinite(pixels) & count[0] & count[1]))
-        std = np.sqrt(tilts.sum(axis=0) + sum(each.error_estimate**2 for each in pair))
-        limit = _student_quantile(1 - tail / 2, min(drifts, default=0))
-        for axis in judged:
-            name = f"tilt along {('rows', 'columns')[axis]}"
-            checks.append(Check(name, float(slopes[axis]), float(std[axis]), 0.0, limit))
+    limits = [(what, rms(pixels), float(predicted.sum()), low, high)]
+    high = _student_quantile(1 - tail / 2, min(drifts, default=0))
+    for axis in judged:
+        name = f"tilt along {('rows', 'columns')[axis]}"
+        limits.append((name, float(slopes[axis]), float(tilts[:, axis].sum()), 0.0, high))
     if blocks:
         means = rms(block_means(difference))
         found = _freedom(pair, variances[:, 1], without_tilt=False, side=BLOCK)
-        limit = fisher_quantile(1 - tail, found, 0.5 / _EXACT**2 if told else _MOST_BLOCKS)
-        expected = float(variances[:, 1].sum()) ** 0.5
-        checks.append(Check("16×16 means, rms", means, expected, 0.0, limit**0.5))
-    return tuple(checks)
+        high = fisher_quantile(1 - tail, found, 0.5 / _EXACT**2 if told else _MOST_BLOCKS) ** 0.5
+        limits.append(("16×16 means, rms", means, float(variances[:, 1].sum()), 0.0, high))
+    solver = sum(each.error_estimate**2 for each in pair)
+    return tuple(
+        # The estimate is no bound: solvers may as well have left nothing.
+        Check(what, found, total**0.5, low * (variance / total) ** 0.5, high)
+        for what, found, variance, low, high in limits
+        for total in [variance + solver]
+    )
 
 
 def _of_bars(pair: Sequence[Calibration], known: Bools) -> tuple[Floats, float, float]:
@@ -381,6 +390,8 @@ def _expected(calibrations: Sequence[Calibration]) -> Array | None:
         blocks = (
             np.nan if each.weighted is None else rms(np.asarray(each.std_of(_some_blocks(each))))
         )
+        if not (pixels > 0 and np.isfinite(each.error_estimate)):
+            return None
         expected.append((pixels, blocks))
     return np.array(expected)
 
@@ -400,13 +411,20 @@ def _some_blocks(calibration: Calibration) -> Array:
     return np.array(weights)
 
 
-def _predictions(predicted: ArrayLike | None, pairs: Ints, count: int) -> dict[str, Array]:
-    """Errors of two calibrations in quadrature, in pixels and in blocks."""
-    if predicted is None:
-        return {}
+def _told(predicted: ArrayLike, count: int) -> Array:
+    """Errors that a caller predicts in pixels and in blocks, checked."""
     errors = as_array("predicted", predicted, ndim=2).astype(np.float64)
     check_count("predicted", len(errors), count)
     if errors.shape[1] != 2:
         raise InputError(f"'predicted' has shape {errors.shape}, expected ({count}, 2)")
-    rms, block_rms = np.sqrt((errors[pairs] ** 2).sum(axis=1)).T
+    if not (np.isfinite(errors) & (errors > 0)).all():
+        raise InputError(f"'predicted' is {errors.tolist()}, expected finite numbers above 0")
+    return errors
+
+
+def _predictions(expected: Array | None, pairs: Ints) -> dict[str, Array]:
+    """Errors of two calibrations in quadrature, in pixels and in blocks."""
+    if expected is None:
+        return {}
+    rms, block_rms = np.sqrt((expected[pairs] ** 2).sum(axis=1)).T
     return {"predicted_rms": rms, "predicted_block_rms": block_rms}

@@ -1,6 +1,7 @@
 """Results of all kinds, read from the files that they were saved to."""
 
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 from equipix.bolometer.dynamic import DynamicCorrection
@@ -10,6 +11,7 @@ from equipix.correction.protocol import Correction
 from equipix.errors import FileError, InputError
 from equipix.hardware import table
 from equipix.io import formats
+from equipix.io.frames import has_format
 from equipix.io.paths import as_path
 from equipix.io.record import read_record
 from equipix.measured.statistics import FrameStatistics
@@ -56,7 +58,8 @@ def load(path: str | PathLike[str]) -> Any:
     """
     suffix = as_path("path", path).suffix.lower()
     if suffix not in SUFFIXES:
-        raise InputError(f"{path}: ends in '{suffix}', expected the suffix {READ}")
+        frames = ". Images are for equipix average" if has_format(Path(path)) else ""
+        raise InputError(f"{path}: ends in '{suffix}', expected the suffix {READ}{frames}")
     if suffix in table.SUFFIXES:
         return table.read_table(path)
     found = read_record(path, *RECORDS)

@@ -13,6 +13,8 @@ import pytest
 
 import equipix
 from equipix import Flag, bolometer, errors, metrics, simulate
+from equipix.bolometer.state_fit import references_of, response_of
+from equipix.report.maps import maps_of
 from equipix.saved_results import load_correction
 from equipix.simulate import BolometerArray
 from records import rewrite
@@ -198,6 +200,13 @@ class TestBadPixels:
         assert np.isnan(corrected).sum() == 3
         assert np.nanstd(corrected) < LIMIT * simulated.span
 
+    def test_maps_are_blank_where_they_are_flagged(self, simulated):
+        mask = np.zeros(SHAPE, bool)
+        mask[3, 4] = True
+        found = bolometer.fit(simulated.shutter, *simulated.at.T, mask=mask)
+        for each in maps_of(found):
+            np.testing.assert_array_equal(np.isnan(each.values), mask)
+
     def test_dead_and_hot_pixels_are_told_by_their_neighbours(self):
         """Towards the edge light is weak: 122 good ones are below half of the mean of all."""
         rows, cols = np.mgrid[-1:1:96j, -1:1:128j]
@@ -352,8 +361,8 @@ class TestRefusals:
                 "'shutter' has shape .* expected at least one state",
             ),
             ({"black_bodies": FRAMES}, "'black_bodies' is no pair"),
-            ({"black_bodies": (FRAMES, FRAMES[:2])}, r"'black_bodies\[1\]' has shape \(2, 2, 3\)"),
-            ({"black_bodies": (FRAMES, FRAMES)}, "'black_bodies' at state 0 differ by 0 DN"),
+            ({"black_bodies": (FRAMES, FRAMES[:2])}, r"'hot' has shape \(2, 2, 3\)"),
+            ({"black_bodies": (FRAMES, FRAMES)}, "'cold' and 'hot' at state 0 differ by 0 DN"),
         ],
     )
     def test_wrong_references_are_refused(self, given, message):
@@ -390,6 +399,60 @@ def test_auto_takes_no_order_that_states_without_one_do_not_determine():
     shutter = [array.mean(c, bias_v=v) for c, v in zip(celsius, volts, strict=True)]
     correction = bolometer.fit(shutter, celsius, volts)
     assert 1 <= correction.axes.order <= 3
+
+
+def test_the_noise_of_a_response_is_that_of_both_black_bodies():
+    rng, good = np.random.default_rng(1), np.ones((16, 20), bool)
+    bodies = [
+        references_of(name, [equipix.average(level + sigma * rng.standard_normal((8, 16, 20)))] * 2)
+        for name, level, sigma in (("cold", 1000.0, 3.0), ("hot", 1400.0, 6.0))
+    ]
+    response, variance = response_of(bodies, good)
+    wanted = (3**2 + 6**2) / 8 / 400**2
+    # Of 320 sample variances of 7 degrees of freedom.
+    np.testing.assert_allclose(variance, wanted, rtol=5 * np.sqrt(2 / 320 / 7))
+    assert response.var() == pytest.approx(wanted, rel=5 * np.sqrt(2 / 640) * np.sqrt(2))
+
+
+class TestBodiesOfOtherStates:
+    """Black bodies exchanged, or in another order than the shutter."""
+
+    @pytest.fixture
+    def series(self):
+        array, celsius = BolometerArray.of((16, 20), rng=1), (-20.0, 0.0, 20.0, 40.0, 60.0)
+        scenes = (None, 0.0, 40.0)
+        return celsius, *([array.mean(t, scene_c=s) for t in celsius] for s in scenes)
+
+    def test_in_their_order_nothing_is_said(self, series):
+        celsius, shutter, *bodies = series
+        assert bolometer.fit(shutter, celsius, 2.0, black_bodies=tuple(bodies)).findings == ()
+
+    def test_a_hot_one_that_is_darker_is_a_note(self, series):
+        celsius, shutter, cold, hot = series
+        with pytest.warns(errors.InputWarning, match="'hot' is darker than 'cold' at every state"):
+            found = bolometer.fit(shutter, celsius, 2.0, black_bodies=(hot, cold))
+        assert [(each.kind, each.severity) for each in found.findings] == [("black_bodies", "note")]
+        wanted = bolometer.fit(shutter, celsius, 2.0, black_bodies=(cold, hot))
+        np.testing.assert_array_equal(found.gain, wanted.gain)
+
+    def test_one_in_reversed_order_is_refused(self, series):
+        celsius, shutter, cold, hot = series
+        with pytest.raises(errors.InputError, match=r"darker by \d+ DN at state 4, expected one"):
+            bolometer.fit(shutter, celsius, 2.0, black_bodies=(cold, hot[::-1]))
+
+    def test_both_in_reversed_order_have_the_patterns_of_other_shutters(self, series):
+        celsius, shutter, cold, hot = series
+        with pytest.warns(errors.MisfitWarning, match="'shutter' at state 4"):
+            found = bolometer.fit(shutter, celsius, 2.0, black_bodies=(cold[::-1], hot[::-1]))
+        assert [each.message[:6] for each in found.findings] == ["'cold'", "'hot' "]
+
+    def test_a_body_as_warm_as_another_substrate_is_no_exchange(self):
+        """Of pixels that differ in gain alone it looks like the shutter there."""
+        gain = 1 + 0.05 * np.random.default_rng(1).standard_normal((16, 20))
+        celsius = np.arange(5) * 20.0
+        shutter, cold, hot = ((1e4 + 30 * at) * gain for at in (celsius[:, None, None], 0, 40))
+        bodies = tuple(np.stack([each] * 5) for each in (cold, hot))
+        assert bolometer.fit(shutter, celsius, 2.0, black_bodies=bodies, order=1).findings == ()
 
 
 class TestOrderOfFewTemperatures:

@@ -132,7 +132,12 @@ def test_findings_and_rejected_values_are_reported(run, experiment, tmp_path):
 def test_inspect_shows_the_calibration(run, calibration):
     status, out, _ = run("inspect", calibration)
     assert status == 0
-    for line in (r"shape +64 × 80", r"converged +yes", r"flagged pixels +DO_NOT_USE 8"):
+    for line in (
+        r"shape +64 × 80",
+        r"converged +yes",
+        r"flagged pixels +DO_NOT_USE 8",
+        r"\n +p0 .* 1 +\[dark\] *\n",
+    ):
         assert re.search(line, out)
     assert re.search(r"shift sign +undetermined", out)
     assert re.search(r"orientation +the data do not determine.*compare the axes of the stage", out)
@@ -143,7 +148,8 @@ def test_inspect_shows_the_calibration(run, calibration):
     assert told["sensitivity_mean"] == pytest.approx(1)
     assert [each["shift"] for each in told["exposures"]] == saved.shifts.tolist()
     assert told["exposures"][0] | {"flux": 1} == {
-        "exposure": "p0", "shift": saved.shifts[0].tolist(), "shift_std": None, "flux": 1
+        "exposure": "p0", "shift": saved.shifts[0].tolist(), "shift_std": None, "flux": 1,
+        "dark": "[dark]",
     }  # fmt: skip
 
 
@@ -508,6 +514,31 @@ def test_files_that_cannot_be_read_say_what_to_do(run, experiment, calibration, 
         result = run(command, path, *(() if command == "inspect" else ("-o", output)))
         refused(result, f"{path}: ", words)
         assert not re.search("codec|zip|Errno|byte 0x|expected str", result[2])
+    for command, name, content, words in (
+        ("average", "text.dng", b"hello", "is no .dng file of a camera that LibRaw reads"),
+        ("average", "text.fits", b"hello", "no .fits file: use a copy, or make it again (it holds"),
+        (
+            "calibrate",
+            "frame.tif",
+            frames.read_bytes(),
+            "is no text, expected the file experiment.toml",
+        ),
+        ("inspect", "raw.tif", frames.read_bytes(), "Images are for equipix average, or for"),
+        ("inspect", "raw.dng", b"hello", "Images are for equipix average"),
+        (
+            "calibrate",
+            "one.toml",
+            b"[[exposure]]\nname = 'a'\nframes = 'b'",
+            "'exposure' holds 1 table, expected",
+        ),
+        ("calibrate", "two.toml", b"exposure = [1, 2]", "[[exposure]] 1 is 1, expected a table"),
+    ):
+        path = tmp_path / name
+        path.write_bytes(content)
+        result = run(command, path, *(() if command == "inspect" else ("-o", output)))
+        refused(result, f"{name}: ", words)
+    result = run("calibrate", tmp_path, "-o", output)
+    refused(result, f"{tmp_path}: is a folder, expected the file experiment.toml")
     for name in ("nosuch.bin", "nosuch.h", "nosuch.npz", "nosuch.tif"):
         refused(run("inspect", tmp_path / name), f"{name}: does not exist")
 
@@ -564,6 +595,24 @@ def test_a_pipe_sees_no_bars(experiment, tmp_path):
     done = subprocess.run(command, capture_output=True, check=True)
     assert done.stderr == b""
     assert b"\x1b" not in done.stdout
+
+
+@pytest.mark.parametrize("arguments", [(), ("--json",), ("--help",)])
+def test_a_pipe_may_be_closed(calibration, arguments):
+    """As `| head` does; what it has not read is no error."""
+    closed, output = os.pipe()
+    os.close(closed)
+    command = command_line("inspect", calibration, *arguments)
+    done = subprocess.run(command, stdout=output, stderr=subprocess.PIPE, check=False)
+    os.close(output)
+    assert (done.returncode, done.stderr) == (1, b"")
+
+
+def test_names_are_no_markup_of_tables(capsys):
+    terminal.show_table(("a[b]", "[/c]"), [("p[red]0[/red]", "[/d] :smile:"), ("x", "inf")])
+    out = capsys.readouterr().out
+    for words in ("a[b]", "[/c]", "p[red]0[/red]", "[/d] :smile:", "not determined"):
+        assert words in out
 
 
 def test_a_terminal_sees_bars(experiment, tmp_path):

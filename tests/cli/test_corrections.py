@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import equipix
 from equipix import bolometer, lens, simulate
 from equipix.io.frames import read_frames
 from equipix.io.tiff import write_frames
+from equipix.report.maps import maps_of
 
 SHAPE = (48, 64)
 NOISE = 3.0
@@ -55,7 +57,7 @@ class TestCombine:
         assert run("nuc", "fit", "today.toml", "--order", "0", "-o", "today.tif")[0] == 0
         status, out, err = run("combine", "curves.tif", "today.tif", "-o", "now.tif", "--json")
         assert (status, err) == (0, "")
-        assert json.loads(out)["order"] == 1
+        assert json.loads(out)["degree"] == 1
         spread = {}
         for name in ("curves", "now"):
             assert run("correct", f"{name}.tif", "raw.tif", "-o", f"by-{name}.tif")[0] == 0
@@ -77,6 +79,20 @@ class TestCombine:
         assert run("combine", tmp_path / "a.npz", tmp_path / "b.npz", "-o", out)[0] == 0
         wanted = equipix.combine(first, then)
         assert equipix.load(out).coefficients.tobytes() == wanted.coefficients.tobytes()
+
+    def test_says_what_limits_the_two(self, run, tmp_path):
+        """Such as a lens that was fitted to frames with their dark."""
+        flat = 1000 * np.ones((16, 20))
+        equipix.nuc.fit([flat, 2 * flat]).save(tmp_path / "curves.npz")
+        rows, cols = np.mgrid[:16, :20]
+        light = 3000 / (1 + ((rows - 8) ** 2 + (cols - 9) ** 2) / 400) ** 2
+        write(tmp_path / "flat.tif", light + 100)
+        assert run("lens", tmp_path / "flat.tif", "-o", tmp_path / "lens.npz")[0] == 0
+        given = (tmp_path / "curves.npz", tmp_path / "lens.npz", "-o", tmp_path / "both.npz")
+        status, printed, err = run("combine", *given)
+        assert status == 0
+        assert "equipix: warning: no dark was subtracted from frames of whole numbers" in err
+        assert re.search(r"findings +raw", printed)
 
     def test_refuses_what_python_refuses(self, run, tmp_path):
         for name, size in (("a", 4), ("b", 5)):
@@ -122,6 +138,21 @@ class TestLens:
         assert [each["kind"] for each in json.loads(printed)["findings"]] == ["raw"]
         assert [each.kind for each in equipix.load(out).findings] == ["raw"]
         assert {"k1", "k2"} <= set(json.loads(printed))
+
+    def test_figures_have_units_and_the_map_is_the_gain(self, run, tmp_path, light):
+        np.save(tmp_path / "flat.npy", light)
+        assert run("lens", tmp_path / "flat.npy", "-o", tmp_path / "lens.tif")[0] == 0
+        saved = equipix.load(tmp_path / "lens.tif")
+        assert [each.name for each in maps_of(saved)] == ["Gain of the correction"]
+        status, printed, _ = run("inspect", tmp_path / "lens.tif")
+        table = dict(re.split(r"  +", line, maxsplit=1) for line in printed.splitlines())
+        assert status == 0
+        assert table["focal length"] == "300 pixels"
+        assert table["centre (row, col)"] == "62, 75 pixels"
+        least = light.min() / 3000
+        assert table["least illumination, relative to the centre"] == f"{least:.4g}"
+        assert "focal length" in table["standard errors"]
+        assert table["degree of the correction in raw values"] == "1"
 
     def test_the_gain_of_the_sensor_is_taken_out(self, run, tmp_path, light):
         rng = np.random.default_rng(1)
@@ -173,15 +204,33 @@ class TestBolometer:
             assert getattr(saved, name).tobytes() == getattr(wanted, name).tobytes()
         told = json.loads(printed)
         assert [each["substrate_c"] for each in told["states"]] == list(CELSIUS)
-        assert told["states"][3]["shutter"] == str(folder / "shutter3.npy")
+        for name in ("shutter", "cold", "hot"):
+            assert told["states"][3][name] == str(folder / f"{name}3.npy")
         assert saved.metadata["states"] == told["states"]
         assert len(saved.metadata["inputs"]) == 15
 
-    def test_chooses_the_order(self, run, folder, tmp_path):
+    def test_chooses_the_order_and_prints_the_errors_of_each(self, run, folder, tmp_path):
         out = tmp_path / "dynamic.npz"
-        assert run(*self.command(folder, out, "--regressor", "inverse"))[0] == 0
-        assert equipix.load(out).axes.regressor == "inverse"
-        assert equipix.load(out).gain is None
+        status, printed, _ = run(*self.command(folder, out, "--regressor", "inverse"))
+        saved = equipix.load(out)
+        assert status == 0
+        assert saved.axes.regressor == "inverse"
+        assert saved.gain is None
+        table = dict(re.split(r"  +", line, maxsplit=1) for line in printed.splitlines())
+        errors = table["rms errors of predicted offsets, order 0 and up"]
+        wanted = np.sqrt(saved.metadata["prediction_errors"])
+        assert errors == ", ".join(f"{each:.6g}" for each in wanted) + " DN"
+        assert table["dead pixels"] == "not determinable without black bodies"
+        assert "temperature of the substrate -20 °C, bias 2 V" in table["states"]
+
+    def test_a_black_body_in_another_order_is_named_as_its_option(self, run, folder, tmp_path):
+        out = tmp_path / "dynamic.npz"
+        bodies = {name: sorted(folder.glob(f"{name}*"), reverse=True) for name in ("cold", "hot")}
+        more = [word for name, files in bodies.items() for file in files for word in (name, file)]
+        more = [f"--{each}" if isinstance(each, str) else each for each in more]
+        status, _, err = run(*self.command(folder, out, *more, "--order", "2"))
+        assert status == 0
+        assert "--cold at state 0 has the pattern of 'shutter' at state 4" in err
 
     @pytest.mark.parametrize(
         ("more", "celsius", "words"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import re
 import subprocess
 import sys
 
@@ -37,8 +38,33 @@ class TestJson:
             ),
             (("average", "FRAMES"), 2, "usage", "Missing option"),
             (("average", "FRAMES", "--foo"), 2, "usage", "No such option: --foo"),
-            (("average", "FRAMES", "-o", "OUT.npz", "--workers", "x"), 2, "usage", "--workers"),
-            (("averag", "FRAMES"), 2, "usage", "Did you mean 'average'"),
+            (
+                ("average", "FRAMES", "-o", "OUT.npz", "--workers", "x"),
+                2,
+                "usage",
+                "--workers is 'x', expected a whole number (see equipix average --help)",
+            ),
+            (
+                ("average", "FRAMES", "-o", "OUT.npz", "--workers", "0"),
+                2,
+                "usage",
+                "--workers is '0', expected at least 1 (see equipix average --help)",
+            ),
+            (
+                ("simulate", "-o", "OUT", "--bit-depth", "20"),
+                2,
+                "usage",
+                "--bit-depth is '20', expected at most 16 (see equipix simulate --help)",
+            ),
+            (
+                ("init", "foo"),
+                2,
+                "usage",
+                "kind is 'foo', expected one of 'experiment', 'levels', 'camera', 'limits' (see",
+            ),
+            (("average", "--force=3"), 2, "usage", "not take a value (see equipix average --help)"),
+            (("averag", "FRAMES"), 2, "usage", "Did you mean 'average'? (see equipix --help)"),
+            (("nuc", "fot"), 2, "usage", "Did you mean 'fit'? (see equipix nuc --help)"),
         ],
     )
     def test_an_error_is_one_object(self, run, frames, tmp_path, arguments, status, code, words):
@@ -50,7 +76,8 @@ class TestJson:
         assert set(told) == {"error", "code"}
         assert told["code"] == code
         assert words in told["error"]
-        assert run(*given)[0] == status
+        assert run(*given) == (status, "", f"equipix: error: {told['error']}\n")
+        assert not re.search("Value error|Input|Invalid", told["error"])
         assert sorted(each.name for each in tmp_path.iterdir()) == ["frames.npy"]
 
     def test_an_object_stands_behind_warnings(self, run, tmp_path):
@@ -84,6 +111,22 @@ class TestJson:
         assert status == 1
         assert json.loads(err)["code"] == "memory"
 
+    def test_it_may_stand_anywhere_on_the_line(self, run):
+        for given in (("--json", "inspect", "none.tif"), ("nuc", "--json")):
+            status, out, err = run(*given)
+            assert (status, out, json.loads(err)["code"]) == (2, "", "usage")
+
+    @pytest.mark.parametrize("given", [("--json",), ()])
+    def test_ctrl_c_has_a_code(self, run, frames, tmp_path, monkeypatch, given):
+        def stopped(*_, **__):
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("equipix.measured.average.find_files", stopped)
+        status, out, err = run("average", frames, "-o", tmp_path / "a.npz", *given)
+        assert (status, out) == (130, "")
+        told = {"error": "stopped by Ctrl-C", "code": "interrupted"}
+        assert err == (json.dumps(told) + "\n" if given else "")
+
     def test_without_it_an_error_is_a_line(self, run):
         assert run("inspect", "none.tif")[2] == "equipix: error: none.tif: does not exist\n"
 
@@ -101,10 +144,13 @@ class TestVerbose:
         twice = run(*given, "-vv")[2]
         assert f"reads {frames}" in twice
         assert "equipix: debug: " in twice
+        for before in ("-v", "-vv"):
+            assert "averaged 3 frames" in run(before, *given)[2]
+        assert "equipix: debug: " in run("-v", *given, "-v")[2]
         # The next call is quiet again.
         assert run(*given) == quiet
 
-    @pytest.mark.parametrize("called", [("nuc", "fit"), ("plan",), ("init",)])
+    @pytest.mark.parametrize("called", [("nuc", "fit"), ("plan",), ("init",), ("nuc",), ()])
     def test_every_command_has_it(self, run, called):
         assert "--verbose" in run(*called, "--help")[1]
 
@@ -150,3 +196,38 @@ def test_the_completion_of_a_shell_is_shown(capsys, monkeypatch):
         cli.main(["--show-completion", "bash"])
     assert done.value.code == 0
     assert "_EQUIPIX_COMPLETE=complete_bash" in capsys.readouterr().out
+
+
+WITHOUT = """
+import sys
+from equipix.cli import main
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name in {"matplotlib", "astropy", "h5py"}:
+            raise ModuleNotFoundError(name)
+
+sys.meta_path.insert(0, Missing())
+for command in sys.argv[1:]:
+    try:
+        main(command.split(" "))
+    except SystemExit:
+        pass
+"""
+
+
+def test_a_file_that_does_not_exist_is_said_before_a_library_is(tmp_path):
+    (tmp_path / "there.fits").touch()
+    commands = {
+        "inspect none.fits": "none.fits: does not exist",
+        "inspect none.nxs": "none.nxs: does not exist",
+        "inspect there.fits": "FITS files need astropy",
+        "inspect none.tif -o a.png": "none.tif: does not exist",
+        "compare none.tif none.tif -o a.png": "none.tif: does not exist",
+        "scene none.tif -o a.tif --picture a.png": "none.tif: does not exist",
+        "demo -o a.png": "pictures need matplotlib",
+    }
+    called = [sys.executable, "-c", WITHOUT, *commands]
+    done = subprocess.run(called, cwd=tmp_path, capture_output=True, text=True, check=True)
+    for line, words in zip(done.stderr.splitlines(), commands.values(), strict=True):
+        assert words in line

@@ -8,6 +8,7 @@ import tomllib
 
 import numpy as np
 import pytest
+from astropy.io import fits
 
 import equipix
 from equipix import CameraExperiment, Experiment, LevelExperiment
@@ -15,7 +16,7 @@ from equipix.experiment.manifest import CameraManifest, LevelManifest, Manifest
 from equipix.experiment.templates import template
 from equipix.io.tiff import write_frames
 from equipix.report.limits import read_limits
-from given import written_experiment
+from given import write_dng, written_experiment
 
 SHAPE = (48, 64)
 
@@ -36,6 +37,13 @@ def write(path, level, count=1):
     rng = np.random.default_rng(level)
     frames = rng.poisson(level, (count, *SHAPE)).astype(np.uint16)
     write_frames(path, frames, nbytes=frames.nbytes)
+
+
+def write_fits(path, time, temperature=-10.0, level=100):
+    """Write a frame with the settings that it was taken with."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    frame = np.random.default_rng(level).poisson(level, (16, 20)).astype(np.uint16)
+    fits.writeto(path, frame, fits.Header({"EXPTIME": time, "CCD-TEMP": temperature}))
 
 
 @pytest.fixture
@@ -70,6 +78,53 @@ class TestExperiment:
             ("40C", "40C/*.tif"),
         ]
         assert found.exposure[1].shift == [0, 5]
+
+    def test_darks_are_parted_by_what_their_files_hold(self, run, tmp_path):
+        taken = [(1.0, -10.0), (4.0, -10.1), (1.0, -20.0), (1.005, -10.2), (4.0, -10.0)]
+        for k, (time, temperature) in enumerate(taken):
+            write_fits(tmp_path / f"dark-{k}.fits", time, temperature, 100 + k)
+        for k in range(3):
+            write_fits(tmp_path / f"p{k}/a.fits", 1.0, level=500 + k)
+        assert run("init", "experiment", tmp_path)[0] == 0
+        path = filled(tmp_path / "experiment.toml", bit_depth=16, shift="[0, 5]")
+        found = Experiment.load(path).manifest
+        assert [(each.frames, each.exposure_s, each.temperature_c) for each in found.dark] == [
+            (["dark-0.fits", "dark-3.fits"], 1.0, -10.0),
+            (["dark-1.fits", "dark-4.fits"], 4.0, -10.1),
+            ("dark-2.fits", 1.0, -20.0),
+        ]
+
+    def test_darks_of_unknown_times_are_asked_for_by_folder(self, run, tmp_path):
+        for k, name in enumerate(("dark-a/0", "dark-a/1", "dark-b/0", "dark-b/1", "p0/0", "p1/0")):
+            write(tmp_path / f"{name}.tif", 100 + k)
+        assert run("init", "experiment", tmp_path)[0] == 0
+        found = tomllib.loads((tmp_path / "experiment.toml").read_text())["dark"]
+        assert found == [
+            {"frames": "dark-a/*.tif", "exposure_s": "?"},
+            {"frames": "dark-b/*.tif", "exposure_s": "?"},
+        ]
+
+    def test_images_of_a_hole_belong_to_the_exposures_of_their_folder(self, run, tmp_path):
+        for k, name in enumerate(("A/dark", "A/p0/0", "A/p1/0", "B/p1/0")):
+            write(tmp_path / f"{name}.tif", 100 + k)
+        for k, name in enumerate(("A/hole-p1-before", "A/hole-p1-after", "C/hole/p1-before")):
+            write(tmp_path / f"{name}.tif", 200 + k)
+        status, _, err = run("init", "experiment", tmp_path)
+        assert status == 0
+        text = (tmp_path / "experiment.toml").read_text()
+        own, other = (each for each in tomllib.loads(text)["exposure"] if "p1" in each["frames"])
+        assert own["aperture_before"] == "A/hole-p1-before.tif"
+        assert own["aperture_after"] == "A/hole-p1-after.tif"
+        assert other["shift"] == "?"
+        assert "C/hole/p1-before.tif: belongs to no exposure by its name\n" in text
+        assert "not used: 'C/hole/p1-before.tif' (belongs to no exposure" in err
+
+    def test_raw_files_of_cameras_hold_their_bit_depth_and_black_level(self, run, tmp_path):
+        for k in range(2):
+            write_dng(tmp_path / f"p{k}.dng", np.full((100, 122), 100 + k, np.uint16))
+        assert run("init", "experiment", tmp_path)[0] == 0
+        path = filled(tmp_path / "experiment.toml", shift="[0, 5]")
+        assert Experiment.load(path).manifest.dark is None
 
     def test_a_blank_is_refused_by_name(self, run, folders):
         run("init", "experiment", folders)
@@ -122,9 +177,29 @@ class TestLevels:
         flat = equipix.Polynomial(np.ones((2, *SHAPE)), np.zeros(SHAPE, np.uint32))
         flat.save(tmp_path / "flat.tif")
         (tmp_path / "notes.txt").write_text("none")
-        assert run("init", "levels", tmp_path)[0] == 0
+        status, out, err = run("init", "levels", tmp_path, "--json")
+        assert status == 0
+        assert json.loads(out)["files_not_used"] == 1
+        assert "not used: 'flat.tif' (holds a polynomial, expected raw frames); " in err
         found = LevelExperiment.load(filled(tmp_path / "levels.toml", bit_depth=16)).manifest
         assert [each.frames for each in found.level] == ["mean1.tif", "mean2.tif"]
+
+    def test_what_was_made_of_the_frames_is_no_level(self, run, folders):
+        """Averages beside their frames, corrected frames, and what is no measurement."""
+        run("average", folders / "20C/*.tif", "-o", folders / "mean.tif")
+        flat = equipix.Polynomial(np.ones((2, *SHAPE)), np.zeros(SHAPE, np.uint32))
+        flat.save(folders.parent / "flat.tif")
+        run("correct", folders.parent / "flat.tif", folders / "40C/*.tif", "-o", folders / "done")
+        write(folders / "science/0.tif", 900)
+        assert run("init", "levels", folders)[0] == 0
+        text = (folders / "levels.toml").read_text()
+        assert [each["name"] for each in tomllib.loads(text)["level"]] == ["20C", "40C"]
+        unused = text.partition("# Images that are not used:\n")[2].splitlines()
+        assert unused == [
+            *(f"#   done/{k}.tif: holds corrected frames, expected raw ones" for k in range(3)),
+            "#   mean.tif: a saved average beside raw frames",
+            "#   science/0.tif: no frames of the sensor by its name",
+        ]
 
 
 class TestCamera:
@@ -143,6 +218,20 @@ class TestCamera:
         wanted = [f"dark/{k if darks > 1 else 0}.tif" for k in range(3)]
         assert [each.dark for each in found.exposure] == wanted
 
+    def test_headers_pair_light_and_dark_by_their_exposure_times(self, run, tmp_path):
+        for k, time in enumerate((0.1, 0.2, 0.4)):
+            for j in range(2):
+                write_fits(tmp_path / f"bright/{k}-{j}.fits", time, level=100 * k + 50 + j)
+                write_fits(tmp_path / f"dark/{2 - k}-{j}.fits", time, level=10 + 2 * k + j)
+        write_fits(tmp_path / "dark/9.fits", 7.0, level=9)
+        status, _, err = run("init", "camera", tmp_path)
+        assert status == 0
+        assert "not used: 'dark/9.fits' (has no counterpart)" in err
+        path = filled(tmp_path / "camera.toml", bit_depth=16, photons=100)
+        found = CameraExperiment.load(path).manifest.exposure
+        assert [each.dark for each in found] == [f"dark/{2 - k}-*.fits" for k in range(3)]
+        assert [each.exposure_s for each in found] == [0.1, 0.2, 0.4]
+
     def test_the_longest_series_is_that_of_the_non_uniformity(self, run, tmp_path):
         for k, count in enumerate((2, 2, 9)):
             write(tmp_path / f"bright/{k}.tif", 100 * k + 50, count)
@@ -152,6 +241,13 @@ class TestCamera:
         found = CameraExperiment.load(path).manifest
         assert len(found.exposure) == 2
         assert (found.spatial.frames, found.spatial.dark) == ("bright/2.tif", "dark/2.tif")
+
+
+def test_a_key_that_has_a_default_shows_it():
+    text = template(Manifest, "All", {"sensor": {}})
+    assert "\n#dark_temperature_tolerance_c = 0.5\n" in text
+    assert "\n#rotation = 0\n" in text
+    assert "\n#skip_bytes = 0\n" in text
 
 
 def test_limits_are_read_as_they_are(run, tmp_path):
@@ -204,7 +300,11 @@ def test_a_folder_that_does_not_exist_is_wrong_usage(run, tmp_path):
 
 
 def test_an_empty_folder_gives_an_example(run, tmp_path):
-    assert run("init", "experiment", tmp_path)[0] == 0
+    status, _, err = run("init", "experiment", tmp_path)
+    assert status == 0
+    words = f"no images were found in '{tmp_path}': the entries for them are examples"
+    assert words in err
+    assert "no images were found" in (tmp_path / "experiment.toml").read_text()
     found = tomllib.loads((tmp_path / "experiment.toml").read_text())
     assert found["dark"][0]["frames"] == "dark/*.tif"
     assert [each["frames"] for each in found["exposure"]] == ["p0/*.tif", "p1/*.tif"]

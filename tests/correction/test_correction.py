@@ -399,7 +399,7 @@ class TestCommandLine:
         told = json.loads(out)
         assert told["shape"] == list(SHAPE)
         assert told["flagged_pixels"] == {"DO_NOT_USE": 1, "DEAD": 1}
-        assert told["order"] == 2
+        assert told["degree"] == 2
         assert told["metadata"] == {"levels": 4}
         assert "sensitivity" not in run("inspect", saved)[1]
 

@@ -275,7 +275,7 @@ def test_a_finding_calls_an_exposure_by_its_name(bench):
     names = [f"position {k}" for k in range(5)]
     exposures = exposures_of(values, SHIFTS)
     (found,) = ask(BEFORE, dataclasses.replace(exposures, names=tuple(names)))
-    assert "exposure 3 ('position 3') has 0.5 times the light" in found.message
+    assert "exposure 'position 3' has 0.5 times the light" in found.message
 
 
 def test_a_prediction_outside_the_beam_is_refused(bench):

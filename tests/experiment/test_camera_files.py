@@ -124,6 +124,8 @@ def test_without_dark_frames_the_black_level_is_the_dark(folder, truth):
     cal = Experiment.load(edited(folder, "dng", NO_DARK)).run(uncertainty=True)
     np.testing.assert_array_equal(cal.dark, np.tile(np.reshape(BLACK, (2, 2)), (32, 40)))
     assert not any(each.kind == "raw" for each in cal.findings)
+    levels = ", ".join(f"{each:g}" for each in BLACK)
+    assert cal.metadata["darks"] == [f"black level {levels} DN in 'p1-0.dng'"] * len(SHIFTS)
     wanted = cal.sensitivity * 0
     for label, plane in Colours.of("RGGB").planes(SHAPE):
         del label

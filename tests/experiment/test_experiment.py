@@ -234,11 +234,15 @@ def test_real_input(data_dir):
     [
         ("[sensor]", "[sensro]", r"unknown key 'sensro'"),
         ("bit_depth", "bits", r"unknown key 'bits' in \[sensor\]"),
-        ('name = "p1"', 'name = "p1"\nshift_std = 1', r"'shift_std' in exposure 1 \('p1'\)"),
+        (
+            'name = "p1"',
+            'name = "p1"\nshift_std = 1',
+            r"'shift_std' in \[\[exposure\]\] 2 \('p1'\)",
+        ),
         (
             'name = "p1"',
             'name = "p1"\nflux_std = 1',
-            r"'flux_std' is given without 'flux' in exposure 1",
+            r"'flux_std' is given without 'flux' in \[\[exposure\]\] 2",
         ),
         (
             'name = "p1"',
@@ -255,7 +259,7 @@ def test_real_input(data_dir):
         ("bit_depth = 12", "xyz = 1", r"'xyz' in \[sensor\]: known are name, bit_depth, "),
         ('name = "p1"', 'name = "p1"\nshift_um = [1, 2]', r"'shift_um' .* divide micrometres"),
         ('name = "p0"', 'name = "p0"\nshift = ["9 um", "0 um"]', r"holds '9 um'.* without a unit"),
-        ('name = "p2"', "", r"key 'name' is missing in exposure 2"),
+        ('name = "p2"', "", r"key 'name' is missing in \[\[exposure\]\] 3"),
         ("bit_depth = 12", "bit_depth = 17", r"holds 17, expected a whole number from 1 to 16"),
         (
             "bit_depth = 12",
@@ -265,17 +269,18 @@ def test_real_input(data_dir):
         ("bit_depth = 12", "saturation = -1", r"'saturation' in \[sensor\] holds -1"),
         ("bit_depth = 12", "gain_dn_per_e = 'x'", r"'gain_dn_per_e' in \[sensor\] holds 'x'"),
         ('name = "p1"', 'name = "p1"\nrotation = 45', r"holds 45, expected 0, 90, 180 or 270"),
-        ('name = "p1"', 'name = "p1"\nflux = 0', r"'flux' in exposure 1 \('p1'\) holds 0"),
+        ('name = "p1"', 'name = "p1"\nflux = 0', r"'flux' in \[\[exposure\]\] 2 \('p1'\) holds 0"),
         ('name = "p1"', 'name = "p1"\nflux = 1', r"'flux' is missing in exposure 'p0'"),
         ('name = "p1"', 'name = "p0"', r"two exposures have the name 'p0'"),
-        ('name = "p1"', 'name = "p1"\nshift = [1, 2]', r"not both in exposure 1 \('p1'\)"),
+        ('name = "p1"', 'name = "p1"\nshift = [1, 2]', r"not both in \[\[exposure\]\] 2 \('p1'\)"),
         ('name = "p0"', 'name = "p0"\nshift = [1]', r"\[row, col\] in pixels"),
         ('name = "p0"', 'name = "p0"\nshift = [1, nan]', r"holds nan, expected \[row, col\]"),
         ('aperture_after = "aperture/p1-after.tif"', "", r"both 'aperture_before' and"),
         ("# calibration", "format = 2\n# calibration", r"'format' holds 2, expected 1"),
         ("[dark]", "[dark", r"is not valid TOML"),
+        ("bit_depth = 12", 'cfa = "RGBX"', r"'RGBX', expected the letters R, G, B, W, C, M, Y"),
         ('frames = "dark/dark.tif"', "", r"key 'frames' is missing in \[dark\]"),
-        ('"frames/p1.tif"', "[]", r"'frames' in exposure 1 \('p1'\) holds \[\]"),
+        ('"frames/p1.tif"', "[]", r"'frames' in \[\[exposure\]\] 2 \('p1'\) holds \[\]"),
         ('"frames/p1.tif"', '"frames/none.tif"', r"frames/none\.tif: does not exist"),
         ('"frames/p1.tif"', '"frames/none*.tif"', r"frames/none\*\.tif: no file matches"),
     ],
@@ -297,8 +302,10 @@ def test_a_mistake_of_all_exposures_is_said_once(manifest, tmp_path):
         Experiment.load(path)
     problems = str(caught.value).removeprefix(f"{path}: ").split("; ")
     assert problems == [
-        "'flux' in exposure 0 ('p0') holds 0, expected a positive number, and likewise in 4 more",
-        "unknown key 'shfit' in exposure 0 ('p0'), and likewise in 4 more: did you mean 'shift'?",
+        "'flux' in [[exposure]] 1 ('p0') holds 0, expected a positive number, and likewise in 4 "
+        "more",
+        "unknown key 'shfit' in [[exposure]] 1 ('p0'), and likewise in 4 more: did you mean "
+        "'shift'?",
     ]
 
 
@@ -349,7 +356,7 @@ def test_values_that_the_bits_do_not_hold_are_refused(edited):
         (np.zeros((2, *SHAPE), np.uint8), r"uint8.*uint16"),
         (
             np.full((2, *SHAPE), 4095, np.uint16),
-            r"experiment\.toml: 'frames': exposure 1 \('p1'\): 100\.0% .* 4095 DN .* .bit_depth.",
+            r"experiment\.toml: 'frames': exposure 'p1': 100\.0% .* 4095 DN .* .bit_depth.",
         ),
         (b"", r"empty"),
         (b"II*\0 nothing more", r"bad\.tif"),

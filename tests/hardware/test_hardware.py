@@ -15,7 +15,7 @@ import tifffile
 import equipix
 import hardware as docs
 import reference
-from equipix import Flag, Polynomial, errors, hardware, nuc
+from equipix import Flag, Polynomial, errors, hardware, metrics, nuc
 from equipix.findings import Finding, usable
 from equipix.hardware.table import UPLOAD
 from equipix.io.tiff import write_frames
@@ -39,6 +39,10 @@ def made():
 def polynomial(*planes, flags=None, shape=(4, 5)):
     full = [np.broadcast_to(np.asarray(plane, float), shape) for plane in planes]
     return Polynomial(np.array(full), np.zeros(shape, np.uint32) if flags is None else flags)
+
+
+def of_12_bits(correction):
+    return dataclasses.replace(correction, metadata={"sensor": {"bit_depth": 12}})
 
 
 def words_of(table, count=3, rng=1):
@@ -102,6 +106,26 @@ def test_wide_words_are_the_correction_within_half_a_step(seed, lowest):
     assert np.abs(found - exact)[inside].max() <= limit
     assert inside.mean() > 0.5
     assert np.all(found[exact < -0.51] == 0)
+
+
+def test_steps_follow_that_of_the_adc():
+    rng = np.random.default_rng(1)
+    correction = polynomial(rng.uniform(-200, 20, SHAPE), rng.uniform(0.7, 1.3, SHAPE), shape=SHAPE)
+    options = {"adc_bits": 8, "adc_step": 16.0, "gain_bits": 8, "out_step": 2.0}
+    table = hardware.Table.of(correction, **options, lowest=39.0)
+    f = table.format
+    # A corrected value of 39 DN is 19.5 steps, rounded down. Pedestals are below 255 steps.
+    assert (f.zero, f.coarse) == (19, 4)
+    _, exact = exact_words(table, correction.coefficients)
+    words = np.arange(256, dtype=np.uint16)[:, None, None] + np.zeros(SHAPE, np.uint16)
+    away = np.abs(table.apply(words) - exact)[(exact > 0) & (exact < 2**16 - 1)].max()
+    told = table.metadata["largest_error_dn"] / 2.0
+    assert told - 0.5 <= away <= told + 0.5
+    # Where offsets are few steps, theirs is that of the product, or of a finer output.
+    for out_step, finest in ((2.0, -3), (2.0**-8, -8)):
+        even = hardware.Table.of(polynomial(0.0, 1.0), **options | {"out_step": out_step})
+        assert (even.format.gain, even.format.offset) == (-7, finest)
+    assert hardware.Table.of(correction, **options, dac_bits=0).format.coarse == 4
 
 
 @pytest.mark.parametrize("bits", [8, 10, 13])
@@ -222,7 +246,8 @@ def compiled(folder, source):
         pytest.skip("no C compiler")
     (folder / "main.c").write_text(source)
     command = [compiler, "-std=c99", "-Wall", "-Wextra", "-Werror"]
-    subprocess.run([*command, folder / "main.c", "-o", folder / "main"], check=True)
+    command += [folder / "main.c", "-o", folder / "main"]
+    subprocess.run(command, check=True, capture_output=True, text=True)
     return folder / "main"
 
 
@@ -239,14 +264,53 @@ int main(void) {{
 """
 
 
-@pytest.mark.parametrize("out_bits", [8, 14, 16])
-def test_the_function_of_the_c_header_gives_the_same_words(made, tmp_path, out_bits):
-    table = hardware.Table.of(made[1], out_bits=out_bits, gain_bits=12, offset_bits=10)
+@pytest.mark.parametrize(
+    "options",
+    [{"out_bits": 8}, {"out_bits": 14}, {}, {"adc_bits": 8, "adc_step": 64.0, "out_step": 2.0**-8}],
+)
+def test_the_function_of_the_c_header_gives_the_same_words(made, tmp_path, options):
+    table = hardware.Table.of(made[1], **{"gain_bits": 12, "offset_bits": 10} | options)
+    assert (table.format.shifts[0] > 0) == ("adc_step" in options)  # that of the product
     table.save(tmp_path / "table.h")
     program = compiled(tmp_path, FILTER.format(name="table", upper="TABLE"))
     words = words_of(table, 30)
     done = subprocess.run([program], input=words.tobytes(), capture_output=True, check=True)
     assert np.array_equal(np.frombuffer(done.stdout, np.uint16), table.apply(words).ravel())
+
+
+def included(folder, names):
+    """Compile a program that includes headers, and calls the function of each."""
+    calls = " + ".join(f"equipix_{c_name}_apply(0, 0)" for c_name in names.values())
+    lines = [*(f'#include "{name}.h"' for name in [*names, *names]), "int main(void) {"]
+    return compiled(folder, "\n".join([*lines, f"    return {calls} < 0;", "}", ""]))
+
+
+def test_names_of_files_give_names_of_their_own(made, tmp_path):
+    names = {"größe": "gru00f6u00dfe", "grüße": "gru00fcu00dfe", "a-b": "a_b"}
+    for gain_bits, name in enumerate(names, start=10):
+        hardware.Table.of(made[1], gain_bits=gain_bits).save(tmp_path / f"{name}.h")
+    included(tmp_path, names)
+    hardware.Table.of(made[1], gain_bits=14).save(tmp_path / "a_b.h")
+    with pytest.raises(subprocess.CalledProcessError) as failed:
+        included(tmp_path, {"a-b": "a_b", "a_b": "a_b"})
+    assert "another table has the names equipix_a_b" in failed.value.stderr
+
+
+@pytest.mark.parametrize("suffix", [".hex", ".h"])
+def test_files_say_in_words_where_the_words_of_a_pixel_are(made, tmp_path, suffix):
+    table = hardware.Table.of(made[1], dac_bits=8, offset_bits=12, gain_bits=13)
+    table.save(tmp_path / f"table{suffix}")
+    said = " ".join((tmp_path / f"table{suffix}").read_text().replace("//", "").split())
+    for words in (
+        "24 rows of 32 pixels, row by row: 768 pixels.",
+        "The first is that of row 0, column 0, which viewers show at the upper left",
+        "2 pixels must not be used; all their words are 0.",
+        "00000001 DO_NOT_USE, 00000002 SATURATED, 00000400 DEAD, 00000800 HOT,",
+    ):
+        assert words in said
+    if suffix == ".hex":
+        assert "768 words of 33 bits, 9 hexadecimal digits each." in said
+        assert "bits: coarse [32:25], offset [24:13], gain [12:0]" in said
 
 
 @pytest.mark.parametrize("bits", [8, 0])
@@ -324,10 +388,25 @@ def test_gains_for_the_upload_of_a_camera(made, tmp_path, run):
     np.testing.assert_array_equal(gain[used], np.rint(1024 * response.coefficients[1][used]))
     assert not gain[~used].any()
     with tifffile.TiffFile(tmp_path / "gain.tif") as file:
-        assert "gain: 12 bits, unsigned, in steps of 2^-10." in file.pages[0].description
-    status, _, told = run(*command, tmp_path / "other.tif", "--gain-bits", "14")
-    assert status == 1
-    assert "--gain-bits is 14, but '--preset upload' has 12: leave one out" in told
+        assert file.pages[0].description == (
+            "gain: 12 bits, unsigned, in steps of 2^-10.\ngain 0: do not use this pixel."
+        )
+    told = json.loads(run(*command, tmp_path / "again.tif", "--json")[1])
+    assert (told["bits"], told["steps"]) == ({"gain": 12}, {"gain": 2.0**-10})
+    assert told.keys().isdisjoint({"base", "zero", "largest_error_dn", "rounding_dn"})
+    with pytest.raises(errors.FileError, match="or wrote it for other programs alone, as gains"):
+        equipix.load(tmp_path / "gain.tif")
+    other, level = tmp_path / "other.tif", tmp_path / "level.tif"
+    for options, words in (
+        ((other, "--gain-bits", 16), "--gain-bits is 16, but '--preset upload' has 12: leave one"),
+        ((other, "--out-bits", 16), "--out-bits is 16, but '--preset upload' writes gains alone"),
+        ((other, "--frames", level), f"--frames is given, but '{other}' holds gains alone"),
+        ((tmp_path / "o.hex",), "o.hex' is no image, but '--preset upload' writes one: name a"),
+    ):
+        status, _, told = run(*command, *options)
+        assert status == 1
+        assert words in told
+        assert not other.exists()
     planes = np.array(response.coefficients)
     planes[1, 3, 4] = 4.5
     with pytest.raises(
@@ -529,13 +608,15 @@ def test_corrections_without_use_are_refused():
         hardware.Table.of(polynomial(0.0, np.nan))
     with pytest.raises(errors.InputError, match="gain of 0 or below in 20 usable pixels"):
         hardware.Table.of(polynomial(0.0, -1.0))
+    with pytest.raises(errors.InputError, match="gain of 0 or below in 5 usable pixels"):
+        hardware.Table.of(polynomial(0.0, np.minimum(np.arange(4.0)[:, None], 1)))
     with pytest.raises(errors.InputError, match="expected a correction"):
         hardware.Table.of("response.tif")
 
 
 def test_a_curved_correction_needs_a_line():
     correction = polynomial(10.0, 1.0, 1e-5)
-    with pytest.raises(errors.InputError, match="of order 2, .* order 1, or give 'linearise'"):
+    with pytest.raises(errors.InputError, match="degree 2 in raw.* order 1, or give 'linearise'"):
         hardware.Table.of(correction)
     table = hardware.Table.of(correction, linearise=(1000.0, 3000.0), out_step=2.0**-3, adc_bits=12)
     # A parabola is c (h/2)² below its chord: 10 DN; half of it is left on either side.
@@ -572,10 +653,33 @@ def test_the_line_of_a_cubic_leaves_half_of_its_sag_on_either_side():
             assert sag == pytest.approx(4 * c * h**3 / 27**0.5, abs=2 * 3 * c * h * (h / 64) ** 2)
 
 
-@pytest.mark.parametrize("linearise", [(1,), 5, (1, 2, 3), (3, 1), ("a", 2), (0, float("inf"))])
-def test_a_range_of_a_line_is_two_rising_values(linearise):
-    with pytest.raises(errors.InputError, match="'linearise' is .*expected two rising raw values"):
-        hardware.Table.of(polynomial(10.0, 1.0, 1e-5), linearise=linearise)
+@pytest.mark.parametrize(
+    "linearise",
+    [(1,), 5, (1, 2, 3), (3, 1), ("a", 2), (0, float("inf")), (0, 4096), (-1, 9), (0, np.nan)],
+)
+def test_a_range_of_a_line_is_two_rising_values_of_the_sensor(linearise):
+    words = "'linearise' is .*expected two rising raw values in DN from 0 to 4095, the largest"
+    correction = of_12_bits(polynomial(10.0, 1.0, 1e-5))
+    with pytest.raises(errors.InputError, match=words):
+        hardware.Table.of(correction, linearise=linearise)
+    hardware.Table.of(correction, linearise=(0, 4095))
+    # Of unknown bits the widest ADC is the limit.
+    with pytest.raises(errors.InputError, match="from 0 to 131070, the largest"):
+        hardware.Table.of(polynomial(1.0, 1.0, 1e-5), linearise=(0, 131071), adc_step=2.0)
+
+
+@pytest.mark.parametrize("lowest", [-51.0, 8141.0])
+def test_the_lowest_value_is_one_that_the_sensor_gives(lowest):
+    # Raw values of 0 to 4095, corrected 2 y - 50 in the first row, y + 10 elsewhere.
+    first = np.arange(4)[:, None] == 0
+    correction = of_12_bits(polynomial(np.where(first, -50, 10.0), np.where(first, 2, 1.0)))
+    words = f"'lowest' is {lowest:g} DN, expected a corrected value from -50 to 8140 DN.* 4095 DN"
+    with pytest.raises(errors.InputError, match=words):
+        hardware.Table.of(correction, lowest=lowest)
+    for inside in (-50.0, 0.0, 100.0):
+        hardware.Table.of(correction, lowest=inside)
+    # The default fits where all corrected values are above it.
+    hardware.Table.of(of_12_bits(polynomial(10.0, 1.0)))
 
 
 def test_frames_that_do_not_fit_are_refused(made):
@@ -607,6 +711,9 @@ def test_the_hash_is_that_of_the_correction(made):
     assert one == other
     changed = polynomial(*(made[1].coefficients + 1e-9), shape=SHAPE, flags=made[1].flags)
     assert hardware.Table.of(changed).metadata["sha256"] != one
+    flags = np.array(made[1].flags)
+    flags[0, 0] = Flag.SATURATED
+    assert hardware.Table.of(made[1].with_flags(flags)).metadata["sha256"] != one
 
 
 def test_the_cost_is_that_of_rounded_gains():
@@ -624,6 +731,78 @@ def test_the_cost_is_that_of_rounded_gains():
         assert found.added == pytest.approx(error / noise, rel=0.005)
         assert found.after.ratio > found.before.ratio
         assert found.at_ends == 0
+
+
+def test_behind_colour_filters_each_plane_is_judged(tmp_path, run):
+    rng = np.random.default_rng(1)
+    light = np.tile([[0.5, 1.0], [1.0, 0.25]], (8, 10))
+    gain = 1 + 0.05 * rng.standard_normal(light.shape)
+
+    def frames(level, count):
+        noise = 8 * rng.standard_normal((count, *light.shape))
+        return np.rint(100 + level * light * gain + noise).astype(np.uint16)
+
+    levels = [equipix.average(frames(level, 32)) for level in (1000.0, 8000.0)]
+    response, raw = nuc.fit(levels, order=1, cfa="RGGB"), frames(4000.0, 8)
+    found = hardware.quality(response, raw, gain_bits=9)
+    exact, words = response.correct(raw), found.table.correct(raw)
+    wanted = metrics.planes(exact, "RGGB")
+    assert [*found.planes] == [*wanted] == ["R", "G1", "G2", "B"]
+    for name, plane in wanted.items():
+        cost, corrected = found.planes[name], metrics.planes(words, "RGGB")[name]
+        assert cost.before == metrics.correctability(plane)
+        assert cost.after == metrics.correctability(corrected)
+        added = np.std((corrected.astype(float) - plane).mean(axis=0))
+        noise = np.sqrt(cost.before.temporal_variance)
+        assert cost.added == pytest.approx(added / noise, rel=1e-9)
+    assert found.added == max(cost.added for cost in found.planes.values())
+    assert (found.before, found.after, found.added) == found.planes[found.worst]
+    # Colours differ by a factor of 4, noise not at all.
+    assert found.before.ratio < 1 < metrics.correctability(exact).ratio
+    widths = hardware.smallest_widths(response, [raw])
+    alone = [hardware.quality(response, raw, gain_bits=bits, offset_bits=16) for bits in (8, 16)]
+    assert [widths.added["gain"][bits] for bits in (8, 16)] == [each.added for each in alone]
+
+    response.save(tmp_path / "response.npz")
+    write_frames(tmp_path / "level.tif", raw, nbytes=1)
+    command = ["hardware", tmp_path / "response.npz", "-o", tmp_path / "table.bin"]
+    status, out, _ = run(*command, "--gain-bits", 9, "--frames", tmp_path / "level.tif", "--json")
+    told = json.loads(out)
+    assert status == 0
+    assert (told["C"], told["worst"]["plane"]) == (found.before.ratio, found.worst)
+    assert {each["plane"]: each["C_of_table"] for each in told["costs"]} == {
+        name: cost.after.ratio for name, cost in found.planes.items()
+    }
+
+
+def test_the_worst_of_several_levels_counts_and_is_named(made, tmp_path, run):
+    array, response = made
+    response.save(tmp_path / "response.npz")
+    levels = []
+    for name, light in (("middle", 8.5e6), ("dim", 3e6)):
+        levels.append(np.stack(list(array.frames(light, 8, rng=3))))
+        write_frames(tmp_path / f"{name}.tif", levels[-1], nbytes=1)
+    command = ["hardware", tmp_path / "response.npz", "-o", tmp_path / "t.bin", "--gain-bits", 10]
+    names = [str(tmp_path / f"{name}.tif") for name in ("middle", "dim")]
+    status, out, _ = run(*command, "--frames", names[0], "--frames", names[1], "--json")
+    assert status == 0
+    told, costs = json.loads(out), [hardware.quality(response, f, gain_bits=10) for f in levels]
+    # The error of a gain grows with the distance from the middle of the ADC.
+    assert costs[1].added > 2 * costs[0].added
+    # Words of the two bad pixels are 0, but do not count.
+    assert [each.at_ends for each in costs] == [0, 0]
+    assert told["worst"] == {"frames": names[1]}
+    assert told["added_noise"] == costs[1].added
+    assert [each["added_noise"] for each in told["costs"]] == [each.added for each in costs]
+    widths = hardware.smallest_widths(response, levels)
+    assert told["sufficient_bits"]["gain"] == widths.gain_bits
+    assert widths.gain_bits > hardware.smallest_widths(response, levels[:1]).gain_bits
+    assert widths.worst["gain"] == (1, "")
+    assert {"bits": "gain", "frames": names[1]} in told["worst_at_sufficient_bits"]
+    write_frames(tmp_path / "one.tif", levels[0][:1], nbytes=1)
+    status, _, said = run(*command, "--force", "--frames", tmp_path / "one.tif")
+    assert status == 1
+    assert "one.tif: holds one frame, expected two or more: each --frames names all of a" in said
 
 
 def test_the_smallest_width_is_the_first_that_suffices():
@@ -684,6 +863,28 @@ def test_the_command_writes_a_table(made, tmp_path, run):
     assert 8 < found["gain"] <= 16
     assert run(*command, "--force", "--gain-bits", 20)[0] == 1
     assert "Example" in run("hardware", "--help")[1]
+
+
+def test_the_errors_that_are_stated_bound_those_of_frames(made, tmp_path, run):
+    response = made[1]
+    response.save(tmp_path / "response.npz")
+    run("hardware", tmp_path / "response.npz", "-o", tmp_path / "table.bin", "--out-bits", 12)
+    table = equipix.load(tmp_path / "table.bin")
+    told = json.loads(run("inspect", tmp_path / "table.bin", "--json")[1])
+    raw = np.random.default_rng(1).uniform(1000, 9000, (50, *SHAPE))
+    away = np.nanmax(np.abs(table.correct(raw) - response.correct(raw)))
+    words, rounding = told["largest_error_dn"], told["rounding_dn"]
+    # A step of the output is 4 DN, so its rounding alone is far beyond the error of the words.
+    assert words + 0.9 * rounding < away <= words + rounding
+    f = table.format
+    assert told["steps"] == {
+        "adc": 1.0,
+        "coarse": 2.0**f.coarse,
+        "offset": 2.0**f.offset,
+        "gain": 2.0**f.gain,
+        "out": 4.0,
+    }
+    assert (told["base"], told["zero"]) == (f.base, f.zero)
 
 
 def test_arrays_of_a_table_fit_together(made):

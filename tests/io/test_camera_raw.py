@@ -57,7 +57,7 @@ def test_the_exposure_time_is_read(tmp_path):
 
 def test_what_is_no_raw_file_is_named(tmp_path):
     (tmp_path / "a.nef").write_bytes(b"no such thing" * 100)
-    with pytest.raises(FileError, match=r"a\.nef: cannot be read: Unsupported file format"):
+    with pytest.raises(FileError, match=r"a\.nef: is no \.nef file of a camera .*Unsupported"):
         equipix.average(tmp_path / "a.nef")
 
 
@@ -66,3 +66,5 @@ def test_a_missing_library_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rawpy", None)
     with pytest.raises(EquipixError, match=r"need rawpy, .*pip install 'equipix\[raw\]'"):
         equipix.average(path)
+    with pytest.raises(FileError, match=r"none\.dng: does not exist"):
+        settings(tmp_path / "none.dng")

@@ -17,6 +17,7 @@ from equipix.measured.noise import (
     step_of,
     unaveraged,
     unaveraged_apart,
+    unaveraged_at,
 )
 from equipix.measured.saturation import clipping_of
 
@@ -159,6 +160,17 @@ def test_what_pixels_less_than_a_step_apart_have_in_common(sigma, spread):
     # The grid of spreads is a thousandth of a step wide.
     found = unaveraged_apart(sigma**2, spread**2 + apart + 0.01, 0.01)
     assert found == pytest.approx(max(apart, 0.1 * unaveraged(sigma**2)), rel=1e-3)
+
+
+@pytest.mark.parametrize("place", [3.5, 3.736, 3.2])
+@pytest.mark.parametrize("sigma", [0.05, 0.13, 0.3])
+def test_the_part_that_pixels_have_apart_follows_their_place_in_a_step(sigma, place):
+    """Light spread by 0.2 steps about one place: at 3.736 the mean over places is too large."""
+    light = place + 0.2 * np.random.default_rng(3).standard_normal(2000)
+    bias = np.array([of_phase(sigma, each % 1)[0] for each in light])
+    found = unaveraged_at(sigma**2, float(np.mean(light + bias)), float(np.var(light + bias)))
+    # Means and variances found agree to a hundredth; 2000 pixels give a variance to 3 %.
+    assert found == pytest.approx(np.var(bias), rel=0.1)
 
 
 def test_means_at_whole_numbers_are_no_saturation():

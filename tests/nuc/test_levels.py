@@ -120,15 +120,19 @@ class TestLevelExperiment:
         ("old", "new", "message"),
         [
             ("[[level]]", "[[levels]]", "unknown key 'levels'"),
-            ("value = 10", "valeu = 10", "unknown key 'valeu' in level 0"),
+            ("value = 10", "valeu = 10", "unknown key 'valeu' in [[level]] 1"),
             (
                 'value = 10\nunit = " °C"',
                 'unit = " °C"',
-                "'unit' is given without 'value' in level",
+                "'unit' is given without 'value' in [[level]]",
             ),
             ('"level1.tif"', '"none.tif"', "none.tif: does not exist"),
             ('"level2.tif"', '"level1.tif"', "'level1.tif' stands in 'frames' of level '10 °C'"),
-            ("value = 10", 'value = "warm"', "'value' in level 0 holds 'warm', expected a number"),
+            (
+                "value = 10",
+                'value = "warm"',
+                "'value' in [[level]] 1 holds 'warm', expected a number",
+            ),
             (
                 'value = 10\nunit = " °C"',
                 'value = 283\nunit = "K"',
@@ -173,7 +177,7 @@ class TestLevelExperiment:
         level = min(int(frame.min()) for frame in frames)
         text = text.replace("bit_depth = 14", f"bit_depth = 14\nsaturation = {level}")
         (folder / "bright.toml").write_text(text, encoding="utf-8")
-        message = rf"level 3 \('40 °C'\): 100.0% .* {level} DN .* 'saturation'"
+        message = rf"level '40 °C': 100.0% .* {level} DN .* 'saturation'"
         with pytest.raises(errors.FileError, match=message):
             LevelExperiment.load(folder / "bright.toml").run()
 
@@ -205,7 +209,7 @@ class TestCommands:
     def test_inspect_tells_names_where_levels_have_no_value(self, run, folder, tmp_path):
         names = '[[level]]\nframes = "{0}/level1.tif"\n[[level]]\nframes = "{0}/level2.tif"\n'
         text = names.format(folder)
-        for head, wanted in (("", None), ('name = "dim"\n', ["0", "dim"])):
+        for head, wanted in (("", None), ('name = "dim"\n', ["1", "dim"])):
             (tmp_path / "levels.toml").write_text(text + head, encoding="utf-8")
             response = LevelExperiment.load(tmp_path / "levels.toml").run()
             response.save(tmp_path / "response.npz", force=True)
@@ -324,9 +328,25 @@ class TestDefectsAndQuality:
         assert told["percentiles_of_K"] == pytest.approx(wanted.gain_percentiles)
         np.testing.assert_array_equal(equipix.load(output).flags, response.flags | wanted.flags)
 
+    def test_filters_are_a_key_of_the_file(self, run, tmp_path):
+        """Of the three commands `defects` and `quality` alone have an option for them."""
+        colour, text = np.tile([[1.0, 2.0], [2.0, 3.0]], (16, 20)), ""
+        for light in (500, 1000, 1500):
+            frames = light * colour + np.random.default_rng(light).normal(0, 3, (4, *colour.shape))
+            write_frames(tmp_path / f"{light}.tif", np.rint(frames).astype(np.uint16), nbytes=1)
+            text += f'[[level]]\nframes = "{light}.tif"\n'
+        (tmp_path / "levels.toml").write_text("[sensor]\nbit_depth = 14\n" + text)
+        out = tmp_path / "r.npz"
+        err = run("nuc", "fit", tmp_path / "levels.toml", "-o", out)[2]
+        assert "no 'cfa' is given" in err
+        assert "(in [sensor] of a manifest)" in err
+        assert "--cfa" not in err
+        assert "write --cfa RGGB" in run("nuc", "defects", out)[2]
+
     def test_defects_of_curves_alone(self, run, saved):
         status, out, _ = run("nuc", "defects", saved[1])
         assert status == 0
+        assert json.loads(run("nuc", "defects", saved[1], "--json")[1])["output"] is None
         assert "non responding" in out
 
     def test_quality_is_that_of_the_functions(self, run, saved, folder):
@@ -357,6 +377,15 @@ class TestDefectsAndQuality:
         # Frames of the fit have noise in common with it.
         told = json.loads(run(*command, folder / "level2.tif", "--json")[1])
         assert told["verdict"].startswith("the pattern is below that of noise: give frames that")
+        # Offsets that have drifted are in all pixels; pixels that jumped are few.
+        steady = np.stack([*array.frames(LIGHT[1], 16, rng=50)]).astype(np.int64)
+        drift = np.rint(40 * np.random.default_rng(1).standard_normal(SHAPE)).astype(np.int64)
+        jumped = np.where(np.arange(drift.size).reshape(SHAPE) % 97, 0, 2000)
+        for change, words in ((drift, "equipix combine with"), (jumped, "by equipix nuc defects")):
+            write_frames(tmp_path / "now.tif", (steady + change).astype(np.uint16), nbytes=1)
+            told = json.loads(run(*command, tmp_path / "now.tif", "--json")[1])
+            assert words in told["verdict"]
+            (tmp_path / "now.tif").unlink()
         plain = tmp_path / "plain.npz"
         coefficients = np.stack([np.zeros(SHAPE), np.ones(SHAPE)])
         equipix.Polynomial(coefficients, np.zeros(SHAPE, np.uint32)).save(plain)

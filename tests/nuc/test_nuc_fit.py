@@ -672,3 +672,49 @@ class TestMisfit:
         levels = noisy(curves(truth(1, rng)), rng)
         with pytest.warns(errors.MisfitWarning, match=r"chi-square 0\.1.*limit 0.5"):
             nuc.fit(levels, order=1, variance=NoiseModel(read_noise=6.0, gain=2.25))
+
+    @pytest.mark.parametrize("order", [1, 2])
+    @pytest.mark.parametrize("cfa", [None, "RGGB"])
+    @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
+    def test_curves_of_the_next_order_are_named_from_where_it_pays(self, order, cfa):
+        """The next coefficient, of variance 1 + s² by noise and spread, pays from s = 1 on."""
+        rng = np.random.default_rng(23)
+        exact = truth(order, rng)
+        flat = nuc.fit(curves(exact), order=order + 1, variance=np.full(len(LEVELS), 25.0))
+        sigma = np.sqrt(flat.variances[-1].mean())
+        for times, expected in ((0.7, False), (1.4, True)):
+            more = np.concatenate([exact, times * sigma * rng.standard_normal((1, *SHAPE))])
+            levels = curves(more) + 5 * rng.standard_normal((len(LEVELS), *SHAPE))
+            found = nuc.fit(levels, order=order, variance=np.full(len(LEVELS), 25.0), cfa=cfa)
+            assert found.reduced_chi2.mean() < 1.6
+            assert ("misfit" in [each.kind for each in found.findings]) is expected
+        ratio = found.metadata["next_power"]["ratio"]
+        pixels = SHAPE[0] * SHAPE[1] / (4 if cfa else 1)
+        # Of a colour the largest of three ratios; its own error beside that of noise alone.
+        assert ratio == pytest.approx(1 + times**2, rel=5 * 2.33 * np.sqrt(2 / pixels))
+        assert f"order={order + 1} or order='auto'" in found.findings[-1].message
+
+    def test_no_order_is_named_where_noise_is_understated(self):
+        rng = np.random.default_rng(24)
+        levels = noisy(curves(truth(1, rng)), rng)
+        with pytest.warns(errors.MisfitWarning, match="order 2 explains no more") as found:
+            nuc.fit(levels, variance=NoiseModel(read_noise=1.0, gain=0.0625))
+        assert "order=" not in str(found[0].message)
+
+    @pytest.mark.study
+    @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
+    def test_linear_sensors_get_no_order(self, draws, figure):
+        said = 0
+        seeds = draws(200)
+        for seed in seeds:
+            rng = np.random.default_rng([25, seed])
+            count = int(rng.integers(3, 9))
+            shape = (16, 20) if seed % 2 else (8, 8)
+            levels = noisy(curves(truth(1, rng, shape), LEVELS[:count]), rng)
+            # Noise that is stated too small, which three levels cannot distinguish from a curve.
+            share = 1.0 if count == 3 else rng.uniform(0.5, 1.1)
+            stated = NoiseModel(NOISE.read_noise * share, NOISE.gain * share**2)
+            found = nuc.fit(levels, variance=stated)
+            said += any("do not follow" in each.message for each in found.findings)
+        figure("linear sensors whose next order is named", "at most 1 %", said / len(seeds))
+        assert said <= 0.01 * len(seeds)

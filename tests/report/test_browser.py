@@ -7,11 +7,13 @@ import re
 import shutil
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
 from report_results import SHAPE, calibration, every_kind
 
 from equipix.report.limits import limits_template, read_limits
-from equipix.report.page import page, part_of
+from equipix.report.maps import Map
+from equipix.report.page import mapped, page, part_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
@@ -108,6 +110,31 @@ def test_arrow_keys_move_over_a_map(browser, address):
             places.append(tuple(map(int, found.groups())))
         (row, col), *others = places
         assert others == [(row + 1, col), (row + 1, col - 10)]
+
+
+def test_reduced_maps_tell_the_pixels_of_a_block(browser, tmp_path):
+    """Those of the last row and column are fewer."""
+    values = np.arange(5.0 * 7).reshape(5, 7)
+    part = part_of("cal", calibration(), read_limits(None))
+    part = part._replace(maps=[mapped(Map("it", "DN", values), 4)])
+    (tmp_path / "it.html").write_text(page([part], "One"), encoding="utf-8")
+    with shown(browser, (tmp_path / "it.html").as_uri(), WIDE) as tab:
+        box = (map_ := tab.locator(".map").first).bounding_box()
+        told = tab.locator("output").first
+        for row, col, words in (
+            (1, 0, "rows 2 to 3, columns 0 to 1: 18.000 DN"),
+            (2, 3, "rows 4 to 4, columns 6 to 6: 34.000 DN"),
+        ):
+            x, y = (col + 0.5) / 4 * box["width"], (row + 0.5) / 3 * box["height"]
+            map_.hover(position={"x": x, "y": y})
+            assert told.inner_text() == words
+
+
+def test_print_opens_what_is_closed(browser, address):
+    with shown(browser, address, WIDE) as tab:
+        tab.evaluate("document.querySelectorAll('details').forEach((each) => each.open = false)")
+        tab.pdf()
+        assert tab.locator("details:not([open])").count() == 0
 
 
 def test_print_shows_ink_on_paper(browser, address):

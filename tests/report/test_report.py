@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import html
 import inspect
 import json
+import os
 import re
 import tomllib
 from enum import Flag
@@ -19,10 +21,26 @@ import equipix
 from equipix import detector, hardware, lens, metrics, nuc, plan, simulate
 from equipix.errors import FileError
 from equipix.pictures import new_figure
-from equipix.report.drawing import draw_histogram
-from equipix.report.limits import LimitsFile, limits_template, read_limits
+from equipix.report.drawing import (
+    draw_convergence,
+    draw_histogram,
+    draw_map,
+    draw_profiles,
+    draw_shifts,
+    draw_spectrum,
+    limits_of,
+)
+from equipix.report.figures import summary, words_of
+from equipix.report.limits import (
+    CalibrationLimits,
+    CameraLimits,
+    LimitsFile,
+    checked,
+    limits_template,
+    read_limits,
+)
 from equipix.report.maps import Map, maps_of
-from equipix.report.page import page, part_of
+from equipix.report.page import mapped, page, part_of
 from equipix.scene.methods import METHODS
 from given import learned, written_camera
 
@@ -97,16 +115,36 @@ def test_values_under_the_pointer_are_those_of_the_map(results):
     np.testing.assert_allclose(read, cal.sensitivity[known], atol=0.51 * (high - low) / 65534)
 
 
-@pytest.mark.parametrize(("shape", "step"), [((30, 40), 1), ((30, 41), 2), ((81, 100), 3)])
+@pytest.mark.parametrize(("shape", "step"), [((30, 40), 1), ((30, 41), 2), ((81, 100), 4)])
 def test_maps_are_reduced_to_block_means(shape, step):
     values = np.random.default_rng(0).standard_normal(shape)
     values[4, 5] = np.nan
     reduced, found = Map("it", "", values).reduced(40)
     assert found == step
-    assert reduced.shape == tuple(size // step for size in shape)
+    assert reduced.shape == tuple(-(-size // step) for size in shape)
     assert max(reduced.shape) <= 40
-    block = values[step : 2 * step, 2 * step : 3 * step]
-    assert reduced[1, 2] == pytest.approx(np.nanmean(block))
+    for row, col in ((1, 2), (-1, 0), (-1, -1)):
+        first, left = (at % size * step for at, size in zip((row, col), reduced.shape, strict=True))
+        block = values[first : first + step, left : left + step]
+        assert reduced[row, col] == pytest.approx(np.nanmean(block))
+
+
+@pytest.mark.parametrize("shape", [(2, 1000), (1000, 3), (1, 1)])
+def test_maps_of_few_rows_or_columns_are_drawn(shape):
+    values = np.arange(np.prod(shape), dtype=float).reshape(shape)
+    drawn = mapped(Map("it", "", values), 40)
+    assert (drawn["rows"], drawn["cols"]) == tuple(-(-size // drawn["step"]) for size in shape)
+    assert drawn["ends"] == list(shape)
+    figure = new_figure(2, 2)
+    draw_map(axes := figure.subplots(), Map("it", "", values))
+    assert (axes.get_xlim()[1], axes.get_ylim()[0]) == (shape[1] - 0.5, shape[0] - 0.5)
+
+
+def test_extremes_are_of_known_values():
+    values = np.array([[np.nan, 3.0, -np.inf], [1.5, np.inf, 2.0]])
+    assert Map("it", "", values).extremes == (1.5, 3.0)
+    assert Map("it", "", np.array([[7, 2]], np.uint16)).extremes == (2.0, 7.0)
+    assert np.isnan(Map("it", "", np.full((2, 2), np.nan)).extremes).all()
 
 
 def test_large_maps_are_reduced_in_parts(monkeypatch):
@@ -121,11 +159,130 @@ def test_maps_without_a_value_are_left_out(results):
     assert all(np.isfinite(each.values).any() for one in results.values() for each in maps_of(one))
 
 
+def test_blocks_of_colour_filters_leave_no_moire():
+    values = np.tile([[1.0, 2.0], [2.0, 5.0]], (45, 60))
+    assert np.ptp(Map("it", "", values).reduced(50)[0]) == 0
+
+
+def test_errors_of_m_count_the_drift_once(results):
+    """Error bars contain the tilt that a drift hides; the solver's estimate is none of them."""
+    cal, shape = results["calibration"], np.array(SHAPE)
+    covariance = np.diag((np.array([3e-3, 4e-3]) / shape) ** 2)
+    drift = dataclasses.replace(
+        cal.drift, size=1e-3, slope_covariance=covariance, tilt_std=np.array([3e-3, 4e-3])
+    )
+    hidden = cal.sensitivity * np.sqrt(drift.variance_map(cal.sensitivity))
+    noise = np.full(SHAPE, 2e-3)
+    drifting = dataclasses.replace(
+        cal,
+        drift=drift,
+        sensitivity_std=np.hypot(noise, hidden),
+        tilt_std=np.array([5e-3, 5e-3]),
+        error_estimate=1.5e-5,
+    )
+    (table,) = (each for each in part_of("it", drifting, NOTHING).tables if "cause" in each.title)
+    assert [row[:2] for row in table.rows] == [
+        ("Noise, of a pixel", "0.002"),
+        ("Noise, of the tilt", "0.004, 0.003"),
+        ("Drift of the lamp", "0.003, 0.004"),
+    ]
+    assert table.caption == (
+        "The estimated error that the solver left, 1.5e-05, is no standard deviation."
+    )
+    plain = dataclasses.replace(cal, drift=None, sensitivity_std=None, tilt_std=None)
+    (table,) = (each for each in part_of("it", plain, NOTHING).tables if "cause" in each.title)
+    assert table.rows == [("Noise", "not computed", "calibrate with --uncertainty")]
+
+
+def test_dead_and_hot_pixels_are_listed_before_those_of_a_mask(results):
+    flags = np.zeros(SHAPE, np.uint32)
+    flags[:12] = equipix.Flag.NO_FLAT_FIELD | equipix.Flag.DO_NOT_USE
+    flags[20, 3] = equipix.Flag.DEAD | equipix.Flag.DO_NOT_USE
+    flags[22, 30] = equipix.Flag.HOT | equipix.Flag.DO_NOT_USE
+    masked = dataclasses.replace(results["calibration"], flags=flags)
+    table = part_of("it", masked, NOTHING).tables[-1]
+    assert table.rows[:3] == [
+        ("20, 3", "do not use, dead"),
+        ("22, 30", "do not use, hot"),
+        ("0, 0", "do not use, no flat field"),
+    ]
+    assert len(table.rows) == 200
+    assert table.caption == "dead 1, hot 1, no flat field 384. 200 of 386 are listed."
+
+
+def test_shifts_and_fluxes_are_listed(results):
+    cal = results["calibration"]
+    table = part_of("it", cal, NOTHING).tables[0]
+    assert table.head == ("Exposure", "Measured (row, col)", "Used (row, col)", "Turned", "Flux")
+    assert [row[0] for row in table.rows] == ["0", "1", "2", "3", "4"]
+    row, col = cal.shifts[1]
+    assert table.rows[1] == ("1", "given", f"{row:.4f}, {col:.4f}", "0°", "1")
+
+
+def test_colours_are_said_of_response_and_beam():
+    shape, shifts = (16, 20), equipix.cross_pattern(3, 5)
+    truth = simulate.filtered(simulate.paper_sensitivity(shape, rng=1), "RGGB")
+    beam = simulate.gaussian_beam(shape, width=60, amplitude=8000)
+    cal = equipix.calibrate(simulate.exposures(truth, beam, shifts), shifts, cfa="RGGB")
+    figures = dict(words_of(summary(cal)))
+    told = figures["mean response of each colour (M has mean 1 within each)"]
+    assert told.startswith(f"R {cal.colour_response['R']:.4g}, G ")
+    assert "Beam L, over the response of each colour" in [each.name for each in maps_of(cal)]
+
+
+def test_ids_of_a_page_are_unique(results):
+    part = part_of("cal", results["calibration"], NOTHING)
+    text = page([part, part], "Two")
+    ids = re.findall(r'\bid="([^"]*)"', text)
+    assert len(ids) == len(set(ids)) > 100
+    used = re.findall(r'(?:href="#|url\(#)([^")]*)', text)
+    assert set(used) <= set(ids)
+    assert "fewer points than on a page of one" in text
+    assert "fewer points than on a page of one" not in page([part], "One")
+
+
+def test_curves_have_names_units_and_signs(results):
+    cal = results["calibration"]
+    figure = new_figure(4, 4)
+    axes = figure.subplots(2, 3).ravel()
+    values = np.add.outer(np.arange(4.0), 10 * np.arange(6.0))
+    draw_profiles(axes[0], Map("It", "DN", values))
+    lines = {line.get_label(): line.get_ydata().tolist() for line in axes[0].lines}
+    assert lines == {
+        "of each row": [25.0, 26.0, 27.0, 28.0],
+        "of each column": [1.5, 11.5, 21.5, 31.5, 41.5, 51.5],
+    }
+    assert axes[0].get_title() == "Medians: It, DN"
+    draw_shifts(axes[1], cal)
+    np.testing.assert_array_equal(axes[1].lines[0].get_xydata(), cal.shifts[:, ::-1])
+    assert [each.get_text() for each in axes[1].texts] == ["0", "1", "2", "3", "4"]
+    assert axes[1].yaxis_inverted()
+    draw_convergence(axes[2], cal)
+    (line,) = axes[2].lines
+    np.testing.assert_array_equal(line.get_xdata(), cal.history["sweep"])
+    np.testing.assert_array_equal(line.get_ydata(), cal.history["error_estimate"])
+    stripes = np.tile([0.0, 2.0], (8, 4))  # of columns: a peak of rows alone, at half a cycle
+    draw_spectrum(axes[3], Map("It", "DN", stripes))
+    along = {line.get_label(): line.get_xydata()[-1].tolist() for line in axes[3].lines}
+    # A wave of amplitude 1 over 8 pixels: |Σ ±1| / √8.
+    assert along["along rows"] == [0.5, pytest.approx(8**0.5)]
+    assert along["along columns"] == [0.5, 0]
+    assert (axes[3].get_xlabel(), axes[3].get_ylabel()) == ("cycles per pixel", "DN")
+    draw_histogram(axes[4], Map("It", "", np.array([[1.0, 2.0, 2.0, np.nan]])))
+    assert axes[4].patches[0].get_data().values.sum() == 3
+    assert axes[4].get_xlabel().startswith("relative;")
+    assert limits_of(Map("it", "", values, "deviation"), np.array([-1.0, 3.0])) == (
+        pytest.approx(-3, rel=1e-2),
+        pytest.approx(3, rel=1e-2),
+    )
+
+
 class TestLimits:
     def test_the_template_is_read_and_judges(self, tmp_path, results):
         path = tmp_path / "limits.toml"
         path.write_text(limits_template())
-        assert {*tomllib.loads(path.read_text())} == {"calibration", "response", "correction"}
+        tables = {"calibration", "response", "correction", "camera", "comparison"}
+        assert {*tomllib.loads(path.read_text())} == tables
         part = part_of("cal", results["calibration"], read_limits(path))
         assert {check.name for check in part.checks} == {
             *("flagged_share", "findings", "sensitivity_std", "tilt_std", "reduced_chi2"),
@@ -155,13 +312,53 @@ class TestLimits:
         assert part.verdict == ("PASS" if passed else "FAIL")
 
     def test_a_figure_that_is_not_known_fails(self, tmp_path):
+        """Not one that a result cannot have, such as a misfit without degrees of freedom."""
         path = tmp_path / "limits.toml"
         path.write_text("[response]\nreduced_chi2 = [0, 10]\n")
-        line = equipix.nuc.fit([equipix.average(measured(level)) for level in (9, 500, 1500)])
-        assert part_of("one", line, read_limits(path)).verdict == "PASS"
-        flat = equipix.nuc.fit([[[1.0, 2.0, 3.0]], [[2.0, 4.0, 6.0]]])
-        (check,) = part_of("two", flat, read_limits(path)).checks
-        assert (check.value, check.passed) == ("not known", False)
+        levels = [equipix.average(measured(level)) for level in (9, 500, 1500)]
+        assert part_of("one", nuc.fit(levels), read_limits(path)).verdict == "PASS"
+        flat = nuc.fit([[[1.0, 2.0, 3.0]], [[2.0, 4.0, 6.0]]])
+        (check,) = (part := part_of("two", flat, read_limits(path))).checks
+        assert (check.value, check.verdict, part.verdict) == (
+            *("this result has none", "not judged"),
+            "",
+        )
+        alike = nuc.fit([level.mean for level in levels])  # a misfit, and no noise to judge it by
+        (check,) = part_of("three", alike, read_limits(path)).checks
+        assert (check.value, check.verdict) == ("not known", "FAIL")
+
+    @pytest.mark.parametrize("kind", ["averages", "scene"])
+    def test_results_without_flags_or_findings_are_not_judged_by_them(
+        self, tmp_path, results, kind
+    ):
+        path = tmp_path / "limits.toml"
+        path.write_text('[correction]\nflagged_share = 0\nfindings = "note"\n')
+        part = part_of(kind, results[kind], read_limits(path))
+        has_findings = kind == "averages"
+        assert {check.name: check.passed for check in part.checks} == {
+            "findings": True if has_findings else None,
+            "flagged_share": None,
+        }
+        text = page([part], "One")
+        assert ("no findings" in text) is not has_findings
+        assert ("nothing contradicts" in text) is has_findings
+        assert text.count(">not judged<") == (1 if has_findings else 3)
+
+    def test_one_of_several_figures_is_enough_to_fail(self):
+        limits = CalibrationLimits(tilt_std=0.01)
+        for values, passed in (((0.01, 0.01), True), ((0.001, 0.02), False)):
+            (check,) = checked(limits, {"tilt_std": dict(zip("rc", values, strict=True))}, ())
+            assert check.passed is passed
+            assert check.value == ", ".join(f"{each:g}" for each in values)
+
+    def test_figures_of_cameras_have_a_largest_or_a_smallest_value(self):
+        limits = CameraLimits(snr_max_db=38, prnu_percent=1)
+        for snr, prnu, passed in ((38, 1, [True, True]), (37, 2, [False, False])):
+            checks = checked(limits, {"snr_max_db": snr, "prnu_percent": prnu}, ())
+            assert [check.passed for check in checks] == passed
+        assert [check.wanted for check in checks] == ["at least 38", "at most 1"]
+        (check,) = checked(CameraLimits(dsnu_e=1), {}, ())
+        assert (check.value, check.verdict) == ("not known", "FAIL")
 
     @pytest.mark.parametrize(
         ("text", "words"),
@@ -173,6 +370,11 @@ class TestLimits:
             ("[calibrations]\nconverged = true", r"'calibrations': did you mean 'calibration'\?"),
             ("[calibration]\nconverged = 1", "'converged' .* holds 1, expected true or false"),
             ("[calibration]\nreduced_chi2 = 1", r"'reduced_chi2' .* holds 1, expected \[low, high"),
+            ("[calibration]\nreduced_chi2 = [2, 1]", r"holds \[2, 1\], expected .* not above"),
+            ("[calibration]\nflagged_share = 1.5", "holds 1.5, expected a share from 0 to 1"),
+            ("[response]\nflagged_share = nan", "holds nan, expected a share from 0 to 1"),
+            ("[calibration]\ntilt_std = -1", "holds -1, expected a number from 0 on"),
+            ("[camera]\ndsnu_e = inf", "holds inf, expected a number of electrons"),
             ("[calibration", "not valid TOML"),
         ],
     )
@@ -201,8 +403,37 @@ class TestCommand:
         assert run(*arguments)[0] == 0
         status, _, told = run(*arguments, "--check", "--force")
         assert status == 1
-        assert f"beyond the limits of {limits}: {saved}" in told
+        assert f"{saved}: findings is warning, expected at most note" in told
         assert "FAIL" in out.read_text(encoding="utf-8")
+        printed = json.loads(run(*arguments, "--force", "--json")[1])
+        assert printed["limits"][str(saved)][0] == {
+            "figure": "findings",
+            "found": "warning",
+            "wanted": "at most note",
+            "verdict": "FAIL",
+        }
+
+    def test_a_check_of_nothing_fails(self, saved, tmp_path, run):
+        limits = tmp_path / "limits.toml"
+        limits.write_text("[response]\nflagged_share = 0.01\n")
+        status, _, told = run(
+            *("report", saved, "-o", tmp_path / "it.html", "--limits", limits, "--check")
+        )
+        assert status == 1
+        assert f"nothing is judged of {saved}: {limits} has no limit" in told
+
+    def test_names_of_files_need_not_be_utf8(self, saved, tmp_path, run):
+        name = tmp_path / os.fsdecode(b"\xff.tif")
+        name.write_bytes(saved.read_bytes())
+        assert run("report", name, "-o", tmp_path / "it.html", "--json")[0] == 0
+        assert "?.tif</h2>" in (tmp_path / "it.html").read_text(encoding="utf-8")
+
+    def test_too_large_a_page_is_refused(self, saved, tmp_path, run, monkeypatch):
+        monkeypatch.setattr("equipix.report.page._MOST_BYTES", 100_000)
+        status, _, told = run("report", saved, "-o", tmp_path / "it.html")
+        assert status == 1
+        assert re.search(r"it.html' would have 0\.\d MB, at most 0: write fewer results", told)
+        assert not (tmp_path / "it.html").exists()
 
     @pytest.mark.parametrize("arguments", [(), ("SAVED",), ("-o", "OUT.html")])
     def test_needs_results_and_a_page(self, tmp_path, run, arguments):
@@ -280,6 +511,22 @@ class TestCamera:
         status, _, told = run("emva", tmp_path, "-o", out)
         assert status == 1
         assert "exists" in told
+
+    def test_is_judged_by_limits(self, tmp_path, run):
+        limits, out = tmp_path / "limits.toml", tmp_path / "it.html"
+        path = written_camera(tmp_path, count=6, spatial=0)
+        limits.write_text("[camera]\nquantum_efficiency_percent = 99\ndark_noise_e = 1e3\n")
+        asked = ("emva", path, "--limits", limits, "--check")
+        status, printed, told = run(*asked, "-o", out)
+        assert status == 1
+        assert re.search("quantum_efficiency_percent is .*, expected at least 99", told)
+        assert "dark_noise_e" not in told
+        assert f"PASS        {path}: dark_noise_e" in printed
+        assert "at least 99" in out.read_text(encoding="utf-8")
+        found = json.loads(run(*asked, "--json")[1])["limits"]
+        assert [each["verdict"] for each in found] == ["FAIL", "PASS"]
+        limits.write_text("[camera]\ndark_noise_e = 1e3\n")
+        assert run(*asked)[0] == 0
 
     def test_planes_are_parts_and_columns(self, tmp_path, run):
         path, out = written_camera(tmp_path, cfa="RGGB", count=18, spatial=0), tmp_path / "it.html"

@@ -19,6 +19,12 @@ from equipix.measured.measured import Measured, measured_of
 from equipix.measured.saturation import clipping
 from equipix.measured.statistics import FrameStatistics
 
+_BODIES = ("cold", "hot")
+"""Names of the black bodies in messages."""
+
+_NEARER = 0.5
+"""Distance of a pattern to that of another state, over that to its own, from which it is of it."""
+
 
 def fit(
     shutter: ArrayLike | Sequence[FrameStatistics],
@@ -44,7 +50,7 @@ def fit(
     black_bodies : tuple of two, optional
         Mean frames of a cold and a hot black body, each as `shutter` and at the same states. Their
         difference gives the gain. Each may have the temperature that suits; it need not be known,
-        and exchanged they give the same.
+        and exchanged they give the same. Messages name them 'cold' and 'hot'.
     order : int or "auto"
         Highest power of the temperature, of offset and gain: 0 is the static correction. "auto"
         takes for each that which best predicts a temperature that is held out.
@@ -65,7 +71,7 @@ def fit(
     ------
     InputError
         If shapes or numbers do not fit, the states do not determine the coefficients, or the black
-        bodies do not differ.
+        bodies do not differ, or by another sign at some states.
 
     Warns
     -----
@@ -74,6 +80,9 @@ def fit(
         times what their noise explains, or if temperature explains nothing. With any order, if the
         pattern of the array before the shutter turns back between two temperatures, as it does
         where some are exchanged. All temperatures in reversed order fit as well as the true ones.
+        If the black bodies have the patterns of the shutter at other states.
+    InputWarning
+        If the hot black body is darker than the cold one.
     InputWarning
         If many values of a reference are exactly the highest one, and not known to saturate.
 
@@ -122,10 +131,11 @@ def fit(
     bodies = [] if black_bodies is None else _bodies(black_bodies, taken.shape, len(taken))
     flags = flags_of(taken, bodies, mask)
     good = usable(flags)
-    named = {"shutter": taken, **{f"black_bodies[{k}]": each for k, each in enumerate(bodies)}}
+    named = {"shutter": taken, **dict(zip(_BODIES, bodies, strict=False))}
     clipped = [_clipping(name, each, good) for name, each in named.items()]
     said = say(*(Finding("saturation", words, "input") for words in clipped if words))
     shown = Observed(taken.values, states, good, _noise(taken, good))
+    said += say(*_on_bodies(bodies, shown))
     chosen, errors, more = _order(shown, order)
     said += more
     axes, offset = _coefficients(shown, chosen)
@@ -191,12 +201,11 @@ def _bodies(given: Any, shape: tuple[int, int], count: int) -> list[Measured]:
     """Frames of the cold and the hot black body."""
     if not isinstance(given, list | tuple) or len(given) != 2:
         raise InputError("'black_bodies' is no pair, expected (cold, hot), each like 'shutter'")
-    bodies = [references_of(f"black_bodies[{k}]", each) for k, each in enumerate(given)]
-    for k, each in enumerate(bodies):
+    bodies = [references_of(name, each) for name, each in zip(_BODIES, given, strict=True)]
+    for name, each in zip(_BODIES, bodies, strict=True):
         if each.values.shape != (count, *shape):
             raise InputError(
-                f"'black_bodies[{k}]' has shape {each.values.shape}, expected {(count, *shape)} "
-                "like 'shutter'"
+                f"'{name}' has shape {each.values.shape}, expected {(count, *shape)} like 'shutter'"
             )
     return bodies
 
@@ -222,18 +231,61 @@ def _clipping(name: str, references: Measured, good: Bools) -> str | None:
     return None
 
 
+def _on_bodies(bodies: Sequence[Measured], shown: Observed) -> Findings:
+    """Say that the black bodies are probably exchanged, or of other states than the shutter."""
+    if not bodies:
+        return ()
+    found = []
+    cold, hot = (each.values[:, shown.good].mean(axis=1) for each in bodies)
+    if np.all(hot < cold):
+        words = (
+            f"'hot' is darker than 'cold' at every state, by {(cold - hot).min():.4g} DN or more: "
+            "either they are exchanged, or the values fall as the scene warms. The correction is "
+            "the same in both cases"
+        )
+        found.append(Finding("black_bodies", words, "input", "note"))
+    for name, body in zip(_BODIES, bodies, strict=True):
+        away = body.values[:, shown.good]
+        own = np.arange(len(away))
+        of_shutter = _nearest(away - away.mean(axis=1, keepdims=True), shown.deviation)
+        # A black body as warm as another substrate may look like it; an exchange moves them all.
+        if len(set(of_shutter)) < len(own) or np.array_equal(of_shutter, own):
+            continue
+        k = int(np.flatnonzero(of_shutter != own)[0])
+        words = (
+            f"'{name}' at state {k} has the pattern of 'shutter' at state {of_shutter[k]}: give "
+            f"the references of '{name}' in the order of 'substrate_c'"
+        )
+        found.append(Finding("states", words, "misfit"))
+    return tuple(found)
+
+
+def _nearest(patterns: Floats, others: Floats) -> Array:
+    """Number of the pattern that is nearest to each; its own unless another is far nearer."""
+    squares = (patterns**2).sum(axis=1)[:, None] + (others**2).sum(axis=1)
+    squares -= 2 * patterns @ others.T
+    far = squares.min(axis=1) >= _NEARER**2 * squares.diagonal()
+    return np.where(far, np.arange(len(patterns)), squares.argmin(axis=1))
+
+
 def response_of(bodies: Sequence[Measured], good: Bools) -> tuple[Floats, Floats | None]:
     """Response of each pixel over the array's at each state, and the variance of that by noise."""
     cold, hot = bodies
     rise = hot.values - cold.values
     mean, scatter = rise[:, good].mean(axis=1), rise[:, good].std(axis=1)
+    if mean.min() < 0 < mean.max():
+        raise InputError(
+            f"'hot' is brighter than 'cold' by {mean.max():.4g} DN at state {mean.argmax()}, and "
+            f"darker by {-mean.min():.4g} DN at state {mean.argmin()}, expected one sign at all "
+            "states: give the references of 'cold' and of 'hot' in the order of 'substrate_c'"
+        )
     weak = np.flatnonzero(~(np.abs(mean) > scatter))
     if weak.size:
         k = int(weak[0])
         raise InputError(
-            f"'black_bodies' at state {k} differ by {mean[k]:.4g} DN in the mean and by "
+            f"'cold' and 'hot' at state {k} differ by {mean[k]:.4g} DN in the mean and by "
             f"{scatter[k]:.4g} DN rms between pixels, expected a difference that all pixels see: "
-            "take black bodies further apart"
+            "take black bodies further apart, and see that both are of this state"
         )
     of_cold, of_hot = (_noise(each, good) for each in bodies)
     variance = None if of_cold is None or of_hot is None else (of_cold + of_hot) / mean**2

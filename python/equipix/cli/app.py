@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 import re
 import sys
 import warnings
@@ -50,6 +51,7 @@ class _Commands(TyperGroup):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
+        self.params += get_command(_verbose).params
         for name, (_, line) in COMMANDS.items():
             self.add_command(TyperCommand(name, help=line))
 
@@ -57,7 +59,8 @@ class _Commands(TyperGroup):
         name, found, rest = super().resolve_command(ctx, args)
         if name is not None:
             found = command(name)
-            CALLED.set(found)
+            # Of a group the command, whose options are not those of the others.
+            CALLED.set(getattr(found, "commands", {}).get(next(iter(rest), ""), found))
         return name, found, rest
 
 
@@ -76,7 +79,7 @@ def command(name: str) -> Any:
     """Import a command, with its options and --verbose."""
     module = import_module(f"equipix.cli.{COMMANDS[name][0]}")
     found = get_group(module.commands).commands[name]
-    for each in getattr(found, "commands", {"": found}).values():
+    for each in {found, *getattr(found, "commands", {}).values()}:
         each.params += get_command(_verbose).params
     return found
 
@@ -85,22 +88,58 @@ _USAGE: Any = typer.BadParameter.__base__
 """What typer raises of a wrong usage; it has no public name."""
 
 
-def run(arguments: list[str] | None) -> None:
+def run(given: list[str]) -> None:
     """Run the command line, errors and warnings as one line each, with --json an error as JSON."""
-    given = sys.argv[1:] if arguments is None else arguments
+    CALLED.set(None)
     as_json = "--json" in given
     with warnings.catch_warnings():
         warnings.simplefilter("always", EquipixWarning)
         warnings.showwarning = show_warning
         try:
-            # Else typer prints what is wrong with the usage, in a box.
-            status = app(given, prog_name="equipix", standalone_mode=not as_json)
+            status = app(given, prog_name="equipix", standalone_mode=False)
+            # Else Python writes what is left at its end, where no error is caught.
+            sys.stdout.flush()
+        except BrokenPipeError:
+            # `| head` has read enough: what is left goes nowhere.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise SystemExit(1) from None
         except (EquipixError, OSError, MemoryError) as error:
             code = getattr(error, "code", "memory" if isinstance(error, MemoryError) else "file")
             _fail(str(error) or type(error).__name__, code, 1, as_json=as_json)
         except _USAGE as error:
-            _fail(error.format_message(), "usage", 2, as_json=as_json)
+            if not (words := _of_usage(error)):  # the help is printed: no command is named
+                raise SystemExit(2) from None
+            _fail(words, "usage", 2, as_json=as_json)
+    if status == _INTERRUPTED:
+        raise KeyboardInterrupt
     raise SystemExit(status or 0)
+
+
+_INTERRUPTED = 130
+"""What typer returns after Ctrl-C."""
+
+_PLAIN = {
+    r"^Invalid value for '([\w-]+)'.*?: ": r"\1: ",
+    r"Value error, (?:'.*?' is not one of (.*?)\.)?": r"expected one of \1",
+    r"Input should be (?:a valid )?([^,]*).*": r"expected \1",
+    r"greater than or equal to": "at least",
+    r"less than or equal to": "at most",
+    r"expected integer": "expected a whole number",
+    r"expected number": "expected a number",
+}
+"""What stands in the place of words of typer and of pydantic, which checks for it."""
+
+
+def _of_usage(error: Any) -> str:
+    """Say what is wrong with the usage; nothing where typer has printed the help instead."""
+    text = error.format_message()
+    for words, plain in _PLAIN.items():
+        text = re.sub(words, plain, text)
+    if checked := getattr(error.__cause__, "errors", None):
+        text = text.replace(": expected", f" is {checked()[0]['input']!r}, expected", 1)
+    place = error.ctx.command_path if error.ctx else f"equipix {CALLED.get().name}"
+    CALLED.set(None)  # options are named as they are
+    return text and f"{text.rstrip('.')} (see {place} --help)"
 
 
 def _fail(message: str, code: str, status: int, *, as_json: bool) -> NoReturn:
@@ -138,8 +177,12 @@ class _Lines(logging.Handler):
         say(record.levelname.lower(), f"{seconds:.2f} s: {record.getMessage()}")
 
 
-def _log(times: int) -> None:
-    """Show what the package logs, of --verbose twice the details too."""
+def _log(context: typer.Context, times: int) -> None:
+    """Show what the package logs, of --verbose twice the details too.
+
+    It may stand before the name of a command, behind it, or in both places.
+    """
+    context.meta["verbose"] = times = context.meta.get("verbose", 0) + times
     logger = logging.getLogger("equipix")
     logger.handlers = [each for each in logger.handlers if not isinstance(each, _Lines)]
     logger.setLevel(logging.NOTSET)

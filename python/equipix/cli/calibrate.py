@@ -10,6 +10,7 @@ import typer
 
 from equipix.calibration.result import Calibration
 from equipix.cli import terminal
+from equipix.comparison import Comparison
 from equipix.comparison import compare as compare_calibrations
 from equipix.errors import EquipixError, InputError
 from equipix.experiment.experiment import Experiment
@@ -19,7 +20,8 @@ from equipix.io.record import read_record
 from equipix.pictures import check_picture, draw_comparison, save_figure
 from equipix.report.drawing import draw_result
 from equipix.report.figures import COMPARED, rows_of, summary
-from equipix.report.page import comparison_parts, page, write_page
+from equipix.report.limits import in_json, read_limits, refuse_beyond
+from equipix.report.page import comparison_checks, comparison_parts, page, write_page
 from equipix.saved_results import READ, load
 
 commands = typer.Typer()
@@ -81,9 +83,9 @@ def inspect(
     as_json: terminal.Json = False,
 ) -> None:
     """Show main figures of a result, and draw its maps."""
-    check_picture(output)
     terminal.check_output(output, [file], force=force)
     content = load(file)
+    check_picture(output)
     result = {"file": str(file), **summary(content)}
     if output is not None:
         save_figure(draw_result(content), output, force=force)
@@ -102,24 +104,34 @@ def compare(
         Path | None,
         typer.Option("--output", "-o", help="A page: .html, or a picture: .png, .pdf or .svg."),
     ] = None,
+    limits: terminal.Limits = None,
+    check: terminal.Check = False,
     force: terminal.Force = False,
     as_json: terminal.Json = False,
 ) -> None:
     """Show how far calibrations of one sensor agree."""
     is_page = output is not None and output.suffix.lower() == ".html"
+    terminal.check_output(output, calibrations, force=force)
+    wanted = read_limits(limits).comparison
+    loaded = [read_record(file, Calibration) for file in calibrations]
     if not is_page:
         check_picture(output)
-    terminal.check_output(output, calibrations, force=force)
-    loaded = [read_record(file, Calibration) for file in calibrations]
     _refuse_equal(calibrations, loaded)
     result = compare_calibrations(loaded)
     names = [str(file) for file in calibrations]
     if output is not None and is_page:
-        text = page(comparison_parts(result, names, loaded), "Calibrations compared")
+        parts = comparison_parts(result, calibrations, loaded, wanted)
+        text = page(parts, "Calibrations compared")
         write_page(output, text, force=force)
     elif output is not None:
         stems = [file.stem for file in calibrations]
         save_figure(draw_comparison(result, stems), output, force=force)
+    judged = {
+        f"{names[i]} − {names[j]}": comparison_checks(
+            result, k, loaded[i].findings + loaded[j].findings, wanted
+        )
+        for k, (i, j) in enumerate(result.pairs)
+    }
     predicted = None if result.predicted_rms is None else result.predicted_rms.tolist()
     pairs: list[dict[str, Any]] = [
         {
@@ -130,22 +142,31 @@ def compare(
             "tilt_compared": not result.open_tilt[k],
             "predicted_rms": predicted and predicted[k],
             "verdict": result.verdicts[k],
-            "checks": [each._asdict() for each in result.checks[k]],
+            "checks": [each._asdict() | {"passed": each.passed} for each in result.checks[k]],
         }
-        for k, pair in enumerate(result.pairs)
+        | ({} if limits is None else {"limits": in_json(checks)})
+        for (k, pair), checks in zip(enumerate(result.pairs), judged.values(), strict=True)
     ]
     pixels = summary(result)["pixels_compared"]
     if as_json:
         terminal.show_result({"pixels": pixels, "pairs": pairs}, as_json=True)
-        return
+    else:
+        _show_pairs(pairs, result, {"pixels compared": pixels, "output": str(output or "none")})
+    if limits is not None and not as_json:
+        terminal.show_limits(judged)
+    if check:
+        refuse_beyond(judged, "calibrate with --uncertainty, or give --limits")
+
+
+def _show_pairs(pairs: list[dict[str, Any]], result: Comparison, words: dict[str, Any]) -> None:
+    """Print what each pair differs by and its verdict, and then `words`."""
     for number, pair in enumerate(pairs):
         print(f"{' − '.join(pair['files'])}: {pair['verdict']}")  # noqa: T201
         terminal.show_table(COMPARED, rows_of(result, number))
-    words: dict[str, Any] = {"pixels compared": pixels, "picture": str(output or "none")}
     if result.open_tilt.any():
-        left_out = {calibrations[i] for pair in result.pairs[result.open_tilt] for i in pair}
+        open_ = [pair["files"] for pair in pairs if not pair["tilt_compared"]]
         words["tilt"] = "left out: free fluxes leave it undetermined in one or more of " + (
-            ", ".join(sorted(map(str, left_out)))
+            ", ".join(sorted({file for files in open_ for file in files}))
         )
     terminal.show_result(words, as_json=False)
 

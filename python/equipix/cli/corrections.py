@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 
 from equipix.bolometer import fit as fit_states
@@ -43,6 +44,7 @@ def combine(
     terminal.check_output(output, [first, then], force=force, suffixes=SUFFIXES)
     both = combine_corrections(load_correction(first), load_correction(then))
     both = replace(both, metadata=with_inputs(both.metadata, sha256_of([first, then])))
+    say(*both.findings)
     terminal.show_saved(output, both, force=force, as_json=as_json)
 
 
@@ -74,16 +76,12 @@ def lens(
     said = flat.findings + (say(Finding("raw", _OFFSET, "input")) if flat.raw else ())
     found = fit_lens(flat.mean, sensitivity=gain, mask=flat.saturated > 0, cfa=cfa, **options)
     made = found.correction()
-    law = {name: made.metadata[name] for name in _LAW if name in made.metadata} | {"std": found.std}
-    origin = {**made.metadata, **law, "inputs": flat.metadata["inputs"]}
+    least = float(1 / np.nanmax(made.coefficients[1]))
+    origin = {**made.metadata, "std": found.std, "least_illumination": least}
+    origin["inputs"] = flat.metadata["inputs"]
     origin = with_inputs(origin, sha256_of(terminal.given(sensitivity)))
     made = replace(made, metadata=origin, findings=said)
-    made.save(output, force=force)
-    terminal.show_result({"output": str(output), **law, **summary(made)}, said, as_json=as_json)
-
-
-_LAW = ("law", "centre", "focal_length", "k1", "k2")
-"""What is told of the law of a lens."""
+    terminal.show_saved(output, made, force=force, as_json=as_json)
 
 
 @commands.command(
@@ -136,8 +134,11 @@ def bolometer(
         )
         options |= {"black_bodies": tuple(bodies) or None, "mask": excluded}
         found = fit_states(first, celsius, volts, **options)
-    shown = zip(series[0], celsius, volts, strict=True)
-    states = [{"shutter": str(file), "substrate_c": at, "bias_v": v} for file, at, v in shown]
+    names = ("shutter", "cold", "hot")[: len(series)]
+    states = [
+        {**dict(zip(names, map(str, each), strict=True)), "substrate_c": at, "bias_v": v}
+        for *each, at, v in zip(*series, celsius, volts, strict=True)
+    ]
     metadata = with_inputs({**found.metadata, "states": states}, sha256_of(files))
     found = replace(found, metadata=metadata)
     found.save(output, force=force)

@@ -9,6 +9,7 @@ import typer
 from equipix.cli import terminal
 from equipix.correction.correct_files import correct_files, is_folder
 from equipix.errors import InputError
+from equipix.experiment.darks import average_findings
 from equipix.experiment.image_files import origin_of, refuse_repeated_files, with_inputs
 from equipix.findings import ask, say
 from equipix.io.formats import SUFFIXES
@@ -60,7 +61,7 @@ def averaged(
             offset = average_frames(dark, progress=progress, **of_dark)
             statistics.refuse_subtracted(offset, " ".join(dark))
         found = average_frames(frames, dark=offset, mask=excluded, progress=progress, **options)
-    said = say(*ask(statistics.AVERAGED, found))
+    said = say(*average_findings(images, offsets), *ask(statistics.AVERAGED, found))
     return replace(found, findings=said, metadata=with_inputs(found.metadata, hashes))
 
 

@@ -1,24 +1,26 @@
 """The command that makes a table of words of a correction."""
 
-from dataclasses import asdict
-from inspect import signature
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 
-from equipix._check import naming_memory
+from equipix._check import Array, naming_memory
 from equipix.cli import terminal
 from equipix.correction.protocol import Correction, check_sensor
 from equipix.errors import InputError
-from equipix.findings import Findings, usable
-from equipix.hardware.quality import quality, smallest_widths
+from equipix.findings import Findings
+from equipix.hardware.quality import Cost, quality, smallest_widths
 from equipix.hardware.table import IMAGES, SUFFIXES, UPLOAD, Table
-from equipix.hardware.words import STEPS
+from equipix.hardware.words import WIDEST
+from equipix.report.figures import summary
 from equipix.saved_results import READ, load_correction
 
 _SOUGHT = ("offset_bits", "gain_bits")
 """Widths of which the smallest that suffice are sought."""
+
+_OF_GAINS = ("output", "shape", "bits", "steps", "unusable_pixels", "correction_sha256")
+"""Figures of a file of gains alone."""
 
 commands = typer.Typer()
 
@@ -39,9 +41,13 @@ commands = typer.Typer()
     offset_step="DN in a step of the offset; the finest that fits.",
     gain_step="Step of the gain; the finest that fits.",
     lowest="Corrected value in DN that the ADC must still see.",
-    linearise="Raw values in DN between which a line replaces a curved correction.",
+    linearise=typer.Option(
+        metavar="LOW HIGH",
+        help="Raw values in DN between which a line replaces a curved correction.",
+    ),
 )
 def hardware(
+    context: typer.Context,
     result: Annotated[Path, typer.Argument(help=f"A correction: {READ}.")],
     output: Annotated[
         Path,
@@ -52,14 +58,15 @@ def hardware(
     frames: Annotated[
         list[str] | None,
         typer.Option(
-            help="Raw frames of one steady even level: show the cost in C, and sufficient widths."
+            help="Raw frames of one steady even level, two or more: show the cost in C, and "
+            "sufficient widths. Once for each level."
         ),
     ] = None,
     preset: Annotated[
         Literal["upload"] | None,
         typer.Option(
-            help="upload: gains in steps of 1/1024 below 4 and no DAC, for a camera's own "
-            "flat-field correction."
+            help="upload: gains in steps of 1/1024 below 4 as .tif, for a camera's own flat-field "
+            "correction."
         ),
     ] = None,
     sensor: terminal.Sensor = None,
@@ -69,61 +76,106 @@ def hardware(
 ) -> None:
     """Write a correction as words for a camera's electronics."""
     terminal.check_output(output, [result], force=force, suffixes=(*SUFFIXES, *IMAGES))
+    gains_alone = output.suffix.lower() in IMAGES
+    if preset:
+        given = {name for name in options if _is_given(context, name)}
+        options |= _preset(output, {name: options[name] for name in given})
+    if frames and gains_alone:
+        raise InputError(
+            f"'frames' is given, but '{output}' holds gains alone, and their cost is that of gains "
+            f"and offsets: leave it out, or write {', '.join(SUFFIXES)}"
+        )
     correction = load_correction(result)
     check_sensor(correction, sensor)
-    if preset:
-        options |= _preset(options)
     table = Table.of(correction, **options)
     cost, said = _cost(correction, frames, options) if frames else ({}, ())
     table.save(output, force=force)
-    figures = {"output": str(output), **_summary(table), **cost}
+    figures = {"output": str(output), **summary(table), **cost}
+    if gains_alone:
+        figures = {name: figures[name] for name in _OF_GAINS}
+        figures |= {name: {"gain": figures[name]["gain"]} for name in ("bits", "steps")}
     terminal.show_result(figures, table.findings + said, as_json=as_json)
 
 
-def _preset(options: dict[str, Any]) -> dict[str, Any]:
-    """Return the options of the preset; no other value may be given for one of them."""
-    known = signature(Table.of).parameters
-    for name, value in UPLOAD.items():
-        if options[name] not in (value, known[name].default):
-            raise InputError(
-                f"'{name}' is {options[name]!r}, but '--preset upload' has {value:g}: leave one out"
-            )
-    return UPLOAD
+def _is_given(context: typer.Context, name: str) -> bool:
+    """Whether an option is on the command line, its default included."""
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"
 
 
-def _summary(table: Table) -> dict[str, Any]:
-    """Collect the main figures of a table."""
-    form = asdict(table.format)
-    linearised = table.metadata.get("linearised")
-    return {
-        "shape": list(table.shape),
-        "bits": {name.removesuffix("_bits"): form[name] for name in form if "_bits" in name},
-        "steps": {name: 2.0 ** form[name] for name in STEPS},
-        "base": table.format.base,
-        "zero": table.format.zero,
-        "unusable_pixels": int((~usable(table.flags)).sum()),
-        "largest_error_dn": table.metadata["largest_error_dn"],
-        **({"sag_dn": linearised["sag_dn"]} if linearised else {}),
-        "correction_sha256": table.metadata["sha256"],
-    }
+def _preset(output: Path, given: dict[str, Any]) -> dict[str, Any]:
+    """Return the options of the preset, which writes gains alone.
+
+    Raises
+    ------
+    InputError
+        If the output is no image, or another option of the words is given.
+    """
+    if output.suffix.lower() not in IMAGES:
+        raise InputError(
+            f"'{output}' is no image, but '--preset upload' writes one: name a file that ends in "
+            f"{' or '.join(IMAGES)}, or leave it out"
+        )
+    for name, value in given.items():
+        if name != "linearise" and value != UPLOAD.get(name):
+            own = f"has {UPLOAD[name]:g}" if name in UPLOAD else "writes gains alone"
+            raise InputError(f"'{name}' is {value!r}, but '--preset upload' {own}: leave one out")
+    # Offsets are not written, so none is to be refused for its step.
+    return UPLOAD | {"offset_bits": WIDEST}
 
 
 def _cost(
     correction: Correction, frames: list[str], options: dict[str, Any]
 ) -> tuple[dict[str, Any], Findings]:
-    """Measure C of frames of one level by correction and table, and the widths that suffice."""
+    """Measure C of frames of each level by correction and table, and the widths that suffice."""
     with naming_memory("measuring quality"):
-        raw, said = terminal.raw_frames(frames)
-        found = quality(correction, raw, **options)
+        read = [_level(pattern) for pattern in frames]
+        found = [quality(correction, raw, **options) for raw, _ in read]
         others = {name: value for name, value in options.items() if name not in _SOUGHT}
-        widths = smallest_widths(correction, [raw], **others)
-    figures = {
-        "C": found.before.ratio,
-        "C_of_table": found.after.ratio,
-        "added_noise": found.added,
-        "words_at_ends_of_adc": found.at_ends,
-        "sufficient_bits": {
-            each: getattr(widths, f"{each}_bits") for each in ("offset", "gain", "both")
-        },
+        widths = smallest_widths(correction, [raw for raw, _ in read], **others)
+
+    costs = {
+        (number, plane): cost
+        for number, level in enumerate(found)
+        for plane, cost in level.planes.items()
     }
-    return figures, said + found.before.findings
+    worst = max(costs, key=lambda place: costs[place].added)
+    named = {
+        (number, plane): {"frames": frames[number], **({"plane": plane} if plane else {})}
+        for number, plane in costs
+    }
+    figures = {
+        **_cost_figures(costs[worst]),
+        "words_at_ends_of_adc": sum(level.at_ends for level in found),
+        "sufficient_bits": {each: getattr(widths, f"{each}_bits") for each in widths.worst},
+    }
+    if len(costs) > 1:
+        figures |= {
+            "worst": named[worst],
+            "worst_at_sufficient_bits": [
+                {"bits": name, **named[place]} for name, place in widths.worst.items()
+            ],
+            "costs": [named[place] | _cost_figures(cost) for place, cost in costs.items()],
+        }
+    said = [each for _, more in read for each in more]
+    said += [each for cost in costs.values() for each in cost.before.findings]
+    return figures, tuple(said)
+
+
+def _level(pattern: str) -> tuple[Array, Findings]:
+    """Read the frames of one level."""
+    raw, said = terminal.raw_frames([pattern])
+    if len(raw) < 2:
+        raise InputError(
+            f"{pattern}: holds one frame, expected two or more: each 'frames' names all of a "
+            'level, as "level/*.tif" does'
+        )
+    return raw, said
+
+
+def _cost_figures(cost: Cost) -> dict[str, float]:
+    return {
+        "C": cost.before.ratio,
+        "C_of_table": cost.after.ratio,
+        "added_noise": cost.added,
+    }

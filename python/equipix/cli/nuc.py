@@ -6,6 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import typer
 
 from equipix import metrics
@@ -18,7 +19,8 @@ from equipix.io.formats import SUFFIXES
 from equipix.io.paths import refuse_inputs
 from equipix.io.record import read_record
 from equipix.measured.colour import Colours
-from equipix.measured.defects import DefectLimits
+from equipix.measured.defects import SIGMAS, DefectLimits
+from equipix.measured.noise import ROBUST
 from equipix.metrics.correctability import Correctability
 from equipix.nuc.defect_search import find_defects
 from equipix.nuc.response import Response, pattern_variance
@@ -99,7 +101,7 @@ def defects(
     flagged = curves.with_flags(found.flags, cfa=cfa, findings=said + found.findings)
     if output is not None:
         flagged.save(output, force=force)
-    result: dict[str, Any] = {"output": str(output or "none"), **found.counts}
+    result: dict[str, Any] = {"output": None if output is None else str(output), **found.counts}
     result |= {kind: f"not determinable {why}" for kind, why in found.not_determinable.items()}
     result |= {"percentiles_of_K": found.gain_percentiles, "flagged_pixels": flag_counts(flagged)}
     terminal.show_result(result, flagged.findings, as_json=as_json)
@@ -141,7 +143,11 @@ def _quality(
         return ({"": corrected} if colours is None else metrics.planes(corrected, colours)).items()
 
     # Of long series one stack of corrected frames at a time is held.
-    usable = {k: metrics.correctability(v, confidence=confidence) for k, v in planes("nan")}
+    usable: dict[str, Correctability] = {}
+    means: dict[str, Array] = {}
+    for name, plane in planes("nan"):
+        usable[name] = metrics.correctability(plane, confidence=confidence)
+        means[name] = plane.mean(axis=0)
     kept = {k: metrics.correctability(v).ratio for k, v in planes("keep")}
     parts = {
         k: {
@@ -157,7 +163,7 @@ def _quality(
             "C": good.ratio,
             "C_from": good.low,
             "C_to": good.high,
-            **_judged(correction, good),
+            **_judged(correction, good, means[name]),
             "C_with_flagged_pixels": kept[name],
             "spatial_variance": good.spatial_variance,
             "temporal_variance": good.temporal_variance,
@@ -169,8 +175,8 @@ def _quality(
     return result[""] if colours is None else result, said
 
 
-def _judged(correction: Correction, found: Correctability) -> dict[str, Any]:
-    """C that the noise of the response predicts, and whether it lies in the interval of C."""
+def _judged(correction: Correction, found: Correctability, mean: Array) -> dict[str, Any]:
+    """C that the noise of the response predicts, whether it lies in the interval, what to do."""
     variance = math.nan
     if isinstance(correction, Response):
         variance = pattern_variance(correction, found.level)
@@ -178,9 +184,26 @@ def _judged(correction: Correction, found: Correctability) -> dict[str, Any]:
     if math.isnan(predicted):
         words = "not judged: no noise is predicted for this correction (a response without filters)"
     elif found.low > predicted:
-        words = "the pattern is above that of noise: see the misfit of the response, or fit again"
+        limit = variance + found.temporal_variance / found.frames
+        words = "the pattern is above that of noise: " + _cause(correction, mean, limit)
     elif found.high < predicted:
         words = "the pattern is below that of noise: give frames that the fit has not used"
     else:
         words = "the pattern is that of noise"
     return {"C_predicted": predicted, "verdict": words}
+
+
+def _cause(correction: Correction, mean: Array, variance: float) -> str:
+    """Say what makes a pattern that is above noise of this variance, and what to do."""
+    away = np.abs(mean - np.nanmedian(mean))
+    far = away > SIGMAS * ROBUST * np.nanmedian(away)
+    odd = int(np.count_nonzero(far))
+    # Without these few pixels the rest is as noise has it.
+    if odd and np.nanvar(mean[~far]) < variance * (1 + SIGMAS * math.sqrt(2 / mean.size)):
+        return f"{odd} pixels far off make it, flag them by equipix nuc defects with these frames"
+    if any(each.kind == "misfit" for each in correction.findings):
+        return "the curves do not follow the levels (see the findings of the response), fit again"
+    return (
+        "all pixels share in it, as where offsets have drifted since the fit: renew them by "
+        "equipix combine with one point of today (docs/infrared.md, section 3)"
+    )

@@ -6,11 +6,11 @@ from typing import Annotated, Any
 import typer
 
 from equipix.cli import terminal
-from equipix.errors import EquipixError, InputError
+from equipix.errors import InputError
 from equipix.hardware.table import Table
 from equipix.io.formats import SUFFIXES
 from equipix.io.viewed import Use
-from equipix.report.limits import read_limits
+from equipix.report.limits import in_json, read_limits, refuse_beyond
 from equipix.report.page import page, part_of, write_page
 from equipix.saved_results import load
 from equipix.scene.scene_correction import SceneCorrection
@@ -24,28 +24,29 @@ commands = typer.Typer()
 def report(
     results: Annotated[list[Path], typer.Argument(help="Results that equipix has saved.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="The page: .html.")],
-    limits: Annotated[
-        Path | None, typer.Option(help="Limits that the figures must keep: .toml.")
-    ] = None,
-    check: Annotated[
-        bool, typer.Option("--check", help="End with status 1 if a figure is beyond its limit.")
-    ] = False,
+    limits: terminal.Limits = None,
+    check: terminal.Check = False,
     force: terminal.Force = False,
     as_json: terminal.Json = False,
 ) -> None:
     """Write results as one page, judged by limits."""
     terminal.check_output(output, results, force=force, suffixes=(".html",))
-    if check and limits is None:
-        raise InputError("--check needs --limits: equipix init limits writes a file of usual ones")
-    wanted = read_limits(limits)
+    wanted = read_limits(limits, check=check)
     parts = [part_of(str(file), load(file), wanted, share=len(results)) for file in results]
     title = f"Report of {results[0].name}" if len(results) == 1 else f"{len(results)} results"
     write_page(output, page(parts, title), force=force)
-    verdicts = {part.name: part.verdict or "not judged" for part in parts}
-    terminal.show_result({"output": str(output), "verdicts": verdicts}, as_json=as_json)
-    failed = [part.name for part in parts if part.verdict == "FAIL"]
-    if check and failed:
-        raise EquipixError(f"beyond the limits of {limits}: {', '.join(failed)}")
+    judged = {part.name: part.checks for part in parts}
+    result: dict[str, Any] = {
+        "output": str(output),
+        "verdicts": {part.name: part.verdict or "not judged" for part in parts},
+    }
+    if as_json:
+        result["limits"] = {name: in_json(checks) for name, checks in judged.items()}
+    terminal.show_result(result, as_json=as_json)
+    if not as_json:
+        terminal.show_limits(judged)
+    if check:
+        refuse_beyond(judged, f"{limits} has no limit for their figures")
 
 
 @commands.command(epilog="Example: equipix convert cal.tif cal.fits --as flat --mean-one")

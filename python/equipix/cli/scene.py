@@ -78,9 +78,9 @@ def scene(
     outputs = {output: SUFFIXES, corrected: _TIFF, state: SUFFIXES, picture: ()}
     for path, suffixes in outputs.items():
         terminal.check_output(path, force=force, suffixes=suffixes)
-    check_picture(picture)
     written = terminal.given(output, corrected, state, picture)
     refuse_inputs(written, [*find_files(frames), *terminal.given(resume, mask)])
+    check_picture(picture)
     if bit_depth is not None:
         if data_range is not None:
             raise InputError("--bit-depth and --data-range exclude each other: leave out one")

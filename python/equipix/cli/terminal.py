@@ -5,7 +5,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -25,6 +25,7 @@ from equipix.io.frames import read_frames
 from equipix.io.paths import find_files, refuse_inputs
 from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.response import Response
+from equipix.report import limits
 from equipix.report.figures import pair_in_words, summary, told, words_of
 
 _Saved = Calibration | FrameStatistics | Polynomial | Response
@@ -47,9 +48,11 @@ def progress_bars(*, announce: bool = False) -> Iterator[Progress | None]:
     # Imported where bars are drawn: it takes as long as the rest of `equipix --help`.
     from rich import console, progress
 
+    # Names may hold [ and ], which else are markup.
+    stage = progress.TextColumn("{task.description}", markup=False)
     columns = (progress.BarColumn(), progress.MofNCompleteColumn(), progress.TimeElapsedColumn())
     err = console.Console(stderr=True)
-    with progress.Progress("{task.description}", *columns, console=err, transient=True) as bars:
+    with progress.Progress(stage, *columns, console=err, transient=True) as bars:
         stages: dict[str, Any] = {}
 
         def report(done: int, total: int, stage: str) -> None:
@@ -87,13 +90,18 @@ def show_result(result: dict[str, Any], found: Findings | None = None, *, as_jso
     for name, words in rows:
         print(f"{name:<{width}}  {words}".replace("\n", "\n" + " " * (width + 2)))  # noqa: T201
     if 0 < len(exposures) <= _MOST_EXPOSURES:
-        show_table(
-            ("exposure", "shift ± standard deviation (row, col), pixels", "flux"),
-            [
-                (e["exposure"], pair_in_words(e["shift"], e["shift_std"]), f"{e['flux']:.5g}")
-                for e in exposures
-            ],
-        )
+        titles = ("exposure", "shift ± standard deviation (row, col), pixels", "flux", "dark")
+        listed: list[tuple[str, ...]] = [
+            (
+                e["exposure"],
+                pair_in_words(e["shift"], e["shift_std"]),
+                f"{e['flux']:.5g}",
+                e["dark"] or "not known",
+            )
+            for e in exposures
+        ]
+        known = 4 if any(e["dark"] for e in exposures) else 3
+        show_table(titles[:known], [row[:known] for row in listed])
 
 
 def show_saved(output: Path, result: _Saved, *, force: bool, as_json: bool) -> None:
@@ -105,11 +113,24 @@ def show_saved(output: Path, result: _Saved, *, force: bool, as_json: bool) -> N
 def show_table(titles: Iterable[str], rows: Iterable[Iterable[str]]) -> None:
     """Print rows of words in columns under titles."""
     from rich import box, console, table
+    from rich.text import Text
 
-    shown = table.Table(*titles, box=box.SIMPLE_HEAD)
+    # Names may hold [ and ], which else are markup.
+    shown = table.Table(box=box.SIMPLE_HEAD)
+    for title in titles:
+        shown.add_column(Text(title))
     for title, *cells in rows:
-        shown.add_row(title, *(re.sub(_NO_NUMBER, "not determined", cell) for cell in cells))
+        words = (re.sub(_NO_NUMBER, "not determined", cell) for cell in cells)
+        shown.add_row(*map(Text, (title, *words)))
     console.Console(soft_wrap=True).print(shown)
+
+
+def show_limits(judged: Mapping[str, Iterable[limits.Check]]) -> None:
+    """Print figures of results with their limits."""
+    for name, checks in judged.items():
+        for each in checks:
+            words = f"{name}: {each.name} {each.value}, expected {each.wanted}"
+            print(f"{each.verdict:<10}  {words}")  # noqa: T201
 
 
 def check_output(
@@ -217,6 +238,16 @@ def options_of(
 Force = Annotated[bool, typer.Option("--force", help="Replace an existing output.")]
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+
+Limits = Annotated[
+    Path | None,
+    typer.Option(help="Limits of the figures: .toml; equipix init limits writes usual ones."),
+]
+
+Check = Annotated[
+    bool,
+    typer.Option("--check", help="End with status 1 where one fails, or nothing is judged."),
+]
 
 Workers = Annotated[int | None, typer.Option(min=1, help="Threads; all processors unless given.")]
 

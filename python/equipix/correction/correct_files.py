@@ -243,9 +243,14 @@ def _outputs(output: Path, files: list[Path]) -> list[Path]:
     return [output / name for name in names]
 
 
+def is_corrected(description: str) -> bool:
+    """Whether the text of a file says that this module has written it."""
+    return description.startswith(_MARK)
+
+
 def warn_of_corrected(headers: Mapping[Path, Header], origin: str) -> Findings:
     """Warn of files whose text this module has written; `origin` as for `correct_files`."""
-    corrected = [file for file, each in headers.items() if each.description.startswith(_MARK)]
+    corrected = [file for file, each in headers.items() if is_corrected(each.description)]
     if not corrected:
         return ()
     others = f" and {len(corrected) - 1} more" if len(corrected) > 1 else ""

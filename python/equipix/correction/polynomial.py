@@ -64,7 +64,7 @@ class Polynomial(RawCorrection, Record, kind="polynomial", version=2):
     def __repr__(self) -> str:
         """Short form: sizes and order."""
         rows, cols = self.shape
-        return f"<Polynomial of {rows} x {cols} pixels, order {len(self.coefficients) - 1}>"
+        return f"<Polynomial of {rows} x {cols} pixels, degree {len(self.coefficients) - 1}>"
 
 
 def combine(first: Correction, then: Correction) -> Polynomial:
@@ -119,8 +119,8 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     after = np.asarray(then.coefficients, np.float64)
     if len(after) > 2:
         raise InputError(
-            f"'then' has order {len(after) - 1}, expected offset and gain: combine in the other "
-            "order, or correct frames twice"
+            f"'then' has degree {len(after) - 1} in the raw value, expected 1, offset and gain: "
+            "combine in the other order, or correct frames twice"
         )
     gain = after[1] if len(after) == 2 else 0.0
     _refuse_raw(then)

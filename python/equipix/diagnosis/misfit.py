@@ -21,7 +21,13 @@ from equipix.fitting.residuals import (
 )
 from equipix.fitting.stated_errors import without_shift_errors
 from equipix.fitting.weighted import Weighted
-from equipix.fitting.windows import misplaced, simulated_chi2, squares, standing_out
+from equipix.fitting.windows import (
+    misplaced,
+    simulated_chi2,
+    simulated_neighbours,
+    squares,
+    standing_out,
+)
 
 _SIGMAS = 5.0
 """Standard errors that noise does not reach."""
@@ -143,9 +149,8 @@ def misfit(
             high, low = _beyond(chi2, std, inexactness)
             low = low and _is_low(chi2, std, weighted.exposures, residuals)
     limit = _limit(std) if high or low else None
-    largest = max(lag_one(residuals.values, residuals.share), key=lambda each: abs(each.z))
-    correlated = abs(largest.z) > _SIGMAS and abs(largest.size) > _CORRELATED
-    correlated &= inexactness <= EXACT
+    largest = _neighbours(weighted, residuals, options)
+    correlated = _is_correlated(largest) and inexactness <= EXACT
     if not correlated:
         # The pattern of one exposure that is flipped is white, and needs no variance to be seen.
         worst = standing_out(_flat(residuals.values))
@@ -157,6 +162,31 @@ def misfit(
     found = _common(weighted, residuals, largest, options) if correlated else None
     cause = found or _cause(weighted, residuals, correlated=bool(correlated), low=low)
     return Misfit(chi2, limit, largest, *cause)
+
+
+def _neighbours(weighted: Weighted, residuals: Residuals, options: FitOptions) -> Correlation:
+    """Correlation of neighbours along the axis where it is the larger, less that of noise.
+
+    A spline follows slow waves of noise better than fast ones, most at the edges, where few
+    exposures see it: the residuals that it leaves are correlated negatively.
+    """
+    both = lag_one(residuals.values, residuals.share)
+    largest = max(both, key=lambda each: abs(each.z))
+    if weighted.fit.beam.coefficients is None or largest.z > 0 or not _is_correlated(largest):
+        return largest
+    of_noise = simulated_neighbours(weighted, options) or ()
+    pairs = zip(both, of_noise, strict=False)
+    return max((_less(*pair) for pair in pairs), key=lambda each: abs(each.z), default=largest)
+
+
+def _less(found: Correlation, of_noise: Correlation) -> Correlation:
+    """A correlation, less the part that it has in common with that of noise."""
+    share = min(max(of_noise.size / found.size, 0.0), 1.0) if found.size else 0.0
+    return Correlation(*((1 - share) * each for each in found))
+
+
+def _is_correlated(neighbours: Correlation) -> bool:
+    return abs(neighbours.z) > _SIGMAS and abs(neighbours.size) > _CORRELATED
 
 
 def _limit(std: float) -> float:

@@ -139,10 +139,15 @@ class Described(Brief, Generic[_Manifest]):
     def _darks(self, workers: int | None = None, progress: Progress | None = None) -> Darks:
         """Average the dark frames that are used; in a camera.toml they stand with exposures."""
         assert not isinstance(self.manifest, CameraManifest)
-        shares, entries = chosen(self.path, self.manifest), self.manifest.dark or []
+        choice, entries = chosen(self.path, self.manifest), self.manifest.dark or []
+        shares = choice.shares
+        if not entries and isinstance(self.manifest, Manifest):
+            file = self.files()[0]
+            levels, black = black_level(file)
+            words = f"black level {levels} DN in '{file.name}'"
+            return Darks((), shares, black, [words] * len(shares))
         if not entries:
-            needed = isinstance(self.manifest, Manifest)
-            return Darks((), shares, black_level(self.files()[0]) if needed else None)
+            return Darks((), shares, words=[""] * len(shares))
         used = [k for k in range(len(entries)) if any(each[k] for each in shares)]
         frames = []
         for k in used:
@@ -151,7 +156,8 @@ class Described(Brief, Generic[_Manifest]):
             files = ", ".join(map(str, self._entry(entries[k].frames)))
             refuse_subtracted(dark, f"{self.path}: {name_of_dark(k, len(entries))} {files}")
             frames.append(dark)
-        return Darks(tuple(frames), [tuple(each[k] for k in used) for each in shares])
+        shares = [tuple(each[k] for k in used) for each in shares]
+        return Darks(tuple(frames), shares, None, choice.words, choice.findings)
 
     @naming_memory("averaging")
     def _average(

@@ -159,7 +159,8 @@ class Experiment(Described[Manifest]):
         Warns
         -----
         InputWarning
-            If the file has ``flux`` or ``time`` that `flux` leaves without use.
+            If the file has ``flux`` or ``time`` that `flux` leaves without use, or the single dark
+            has another exposure time or temperature than frames by the headers of the files.
 
         Notes
         -----
@@ -177,6 +178,7 @@ class Experiment(Described[Manifest]):
             )
         excluded, hashes = self._checked(mask)
         darks = self._darks(workers, progress)
+        said += say(*darks.findings)
         hot = darks.hot
         averaged = self._average(darks, workers, progress)
         colours = Equalisation.of_colours(averaged.filters, darks.means)
@@ -212,6 +214,7 @@ class Experiment(Described[Manifest]):
             hashes,
             averaged.noise,
             exposures=[exposure.name for exposure in self.manifest.exposure],
+            darks=list(darks.words),
             measured_shifts=shifts.tolist(),
             measured_shift_std=std.tolist(),
         )

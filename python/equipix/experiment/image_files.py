@@ -96,10 +96,13 @@ def completed(path: Path, manifest: _Manifest) -> _Manifest:
     return manifest.model_copy(update={"sensor": sensor.model_copy(update=own)})
 
 
-def black_level(file: Path) -> Array:
-    """Black level of each pixel, in DN, that a raw file holds."""
+def black_level(file: Path) -> tuple[str, Array]:
+    """Black level, in DN, that a raw file holds: in words, and of each pixel."""
     _, rows, cols = frame_format(file)[0]
-    return _told(file).dark((rows, cols))
+    told = _told(file)
+    levels = [f"{level:g}" for row in told.black for level in row]
+    words = levels[0] if len({*levels}) == 1 else ", ".join(levels)
+    return words, told.dark((rows, cols))
 
 
 def _told(file: Path) -> camera_raw.Told:

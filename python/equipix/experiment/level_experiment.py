@@ -84,6 +84,9 @@ class LevelExperiment(Described[LevelManifest]):
 
         Warns
         -----
+        InputWarning
+            If the single dark has another exposure time or temperature than levels by the headers
+            of the files.
         MisfitWarning
             If the mean of a level is lower than that of a level with a lower value, beside the
             warnings of `equipix.nuc.fit`.
@@ -93,13 +96,16 @@ class LevelExperiment(Described[LevelManifest]):
         darks = self._darks(workers, progress)
         averaged = self._average(darks, workers, progress).counted_from_lowest()
         levels = levels_of(averaged, mask=excluded)
+        said = say(*darks.findings)
+        levels = replace(levels, findings=said + levels.findings)
         if words := self._falling(levels):
             said = say(Finding("light", words, "misfit"))
             levels = replace(levels, findings=levels.findings + said)
-        named = zip(self.manifest.names, self.manifest.level, levels.references, strict=True)
+        means = map(float, levels.references)
+        named = zip(self.manifest.names, self.manifest.level, means, darks.words, strict=True)
         written = [
-            {"name": name, "value": level.value, "unit": level.unit, "mean": float(mean)}
-            for name, level, mean in named
+            {"name": name, "value": level.value, "unit": level.unit, "mean": mean, "dark": dark}
+            for name, level, mean, dark in named
         ]
         origin = self._provenance(hashes, averaged.noise, levels=written)
         return fitted(levels, order=order, by=by, workers=workers, provenance=origin)

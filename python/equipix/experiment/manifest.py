@@ -43,6 +43,9 @@ FILES = "a file, a glob or a list of them"
 
 DARKS = "a table [dark], or tables [[dark]]"
 
+_FILTERS = "RGBWCMYEI"
+"""Letters of colour filters: primary ones, white, complementary ones, emerald, infrared."""
+
 _Content = TypeVar("_Content", bound="Table")
 
 
@@ -167,7 +170,7 @@ class Sensor(Table):
         "a positive number (DN per electron)", "gain for the noise model; fitted unless given", 0.3
     )
     cfa: Text | list[Text] | list[list[Text]] | None = key(
-        "colour filters: 'RGGB', rows of one period or lists of labels",
+        "colour filters: letters such as 'RGGB', rows of one period, or lists of labels",
         "colour filters of the pixels: see [colour.md](colour.md)",
         "RGGB",
     )
@@ -191,6 +194,11 @@ class Sensor(Table):
             Colours.of(self.cfa)
         except InputError as error:
             raise _problem(f"[sensor]: {error}") from error
+        if isinstance(self.cfa, str) and {*self.cfa} - {*_FILTERS, "/"}:
+            raise _problem(
+                f"'cfa' in [sensor] is {self.cfa!r}, expected the letters {', '.join(_FILTERS)}: "
+                'other filters have labels in lists, as in [["R", "X"], ["G", "B"]]'
+            )
         return self
 
     @model_validator(mode="after")
@@ -314,6 +322,11 @@ class Level(Taken):
     """One ``[[level]]``: frames of a uniform source, and what the source was set to."""
 
     frames: Files = needed(FILES, "frames of this level, or their saved average", "20C/*.tif")
+    temperature_c: FiniteFloat | None = key(
+        "a number of degrees Celsius",
+        "temperature of the sensor, not of the source, by which a dark is chosen",
+        -10.0,
+    )
     name: str = key("a text", "name of the level; its value or number unless given", "20C", "")
     value: FiniteFloat | None = key(
         "a number", "what the source was set to; means should rise with it", 20
@@ -361,7 +374,7 @@ class LevelManifest(WholeFile):
         """Name of each level: its own, its value, or its number."""
         return [
             each.name or (f"{index}" if each.value is None else f"{each.value:g}{each.unit or ''}")
-            for index, each in enumerate(self.level)
+            for index, each in enumerate(self.level, start=1)
         ]
 
     @property
@@ -387,12 +400,12 @@ class Manifest(WholeFile):
         first, *others = self.exposure
         if first.aperture_before is not None:
             raise _problem(
-                f"exposure 0 ('{first.name}') has aperture images, but no move before it"
+                f"[[exposure]] 1 ('{first.name}') has aperture images, but no move before it"
             )
-        for number, exposure in enumerate(others, start=1):
+        for number, exposure in enumerate(others, start=2):
             if exposure.aperture_before is None and exposure.shift is None:
                 raise _problem(
-                    f"exposure {number} ('{exposure.name}') needs 'aperture_before' and "
+                    f"[[exposure]] {number} ('{exposure.name}') needs 'aperture_before' and "
                     "'aperture_after', or 'shift'"
                 )
         names = [exposure.name for exposure in self.exposure]
@@ -456,7 +469,13 @@ class CameraLight(Table):
 class CameraManifest(WholeFile):
     """The whole camera.toml."""
 
-    unused: ClassVar = ("saturation", "gain_dn_per_e", "mask", "region")
+    unused: ClassVar = (
+        "saturation",
+        "gain_dn_per_e",
+        "dark_temperature_tolerance_c",
+        "mask",
+        "region",
+    )
     """Keys of ``[sensor]`` that it does not have."""
 
     light: CameraLight | None = key("a table", "what turns an irradiance into photons")
@@ -470,10 +489,10 @@ class CameraManifest(WholeFile):
     @model_validator(mode="after")
     def _figures_of_all_pixels(self) -> Self:
         for name in self.unused:
-            if getattr(self.sensor, name) is not None:
+            if name in self.sensor.model_fields_set:
                 raise _problem(
                     f"'{name}' in [sensor] is not for a camera.toml: the figures are of all "
-                    "pixels, and gain and saturation are measured"
+                    "pixels, gain and saturation are measured, and each level names its dark"
                 )
         if self.light is None and any(each.photons is None for each in self.exposure):
             raise _problem(
@@ -485,7 +504,7 @@ class CameraManifest(WholeFile):
     def series(self) -> list[tuple[str, Series]]:
         """Each exposure by its name, or its number, and the frames for the non-uniformity."""
         spatial: list[tuple[str, Series]] = [("spatial", self.spatial)] if self.spatial else []
-        return [(each.name or str(k), each) for k, each in enumerate(self.exposure)] + spatial
+        return [(each.name or str(k), each) for k, each in enumerate(self.exposure, 1)] + spatial
 
     @property
     def measurements(self) -> list[tuple[str, Series]]:
@@ -532,13 +551,26 @@ def read_manifest(path: Path, model: type[_Content]) -> _Content:
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
-        raise FileError(f"{path}: cannot be read: {error.strerror}") from error
+        why = "is a folder" if path.is_dir() else f"cannot be read: {error.strerror}"
+        raise FileError(f"{path}: {why}, expected {_called(model)}") from error
     except UnicodeDecodeError as error:
+        if b"\0" in error.object:
+            raise FileError(f"{path}: is no text, expected {_called(model)}") from None
         line = error.object.count(b"\n", 0, error.start) + 1
         raise FileError(f"{path}: line {line} is no UTF-8: save it as UTF-8, as TOML is") from None
     except tomllib.TOMLDecodeError as error:
         raise FileError(f"{path}: is not valid TOML: {error}") from error
     return checked_content(path, content, model)
+
+
+def _called(model: type[Table]) -> str:
+    """Name the file that a model is the schema of."""
+    names: dict[type[Table], str] = {
+        Manifest: "the file experiment.toml",
+        LevelManifest: "the file levels.toml",
+        CameraManifest: "the file camera.toml",
+    }
+    return names.get(model, "a TOML file")
 
 
 def checked_content(path: Path, content: dict[str, Any], model: type[_Content]) -> _Content:
@@ -602,7 +634,19 @@ def _sentence(detail: ErrorDetails, content: dict[str, Any], model: type[Table])
     value = detail["input"]
     if named in ("exposure", "level") and isinstance(value, dict):
         return f"[{named}] is one table: write [[{named}]], with two brackets, for each {named}", ""
-    return f"'{named}'{place} holds {value!r}, expected {wanted}", ""
+    if isinstance(location[-1], int) and named in ("exposure", "level", "dark", "region"):
+        return f"[[{named}]] {location[-1] + 1} is {_held(value)}, expected a table", ""
+    return f"'{named}'{place} holds {_held(value)}, expected {wanted}", ""
+
+
+def _held(value: object) -> str:
+    """Write a value; of tables their number and keys."""
+    match value:
+        case dict():
+            return f"a table with the keys {', '.join(value) or 'none'}"
+        case [dict(), *_]:
+            return f"{len(value)} table" + "s" * (len(value) > 1)
+    return repr(value)
 
 
 def _described(model: type[Table], location: tuple[object, ...]) -> tuple[str, str, type[Table]]:
@@ -629,7 +673,7 @@ def _nearest(unknown: str, table: type[Table]) -> str:
 def _place(location: tuple[int | str, ...], content: dict[str, Any]) -> str:
     match location:
         case ["exposure" | "level" as kind, int(index), *_]:
-            return f" in {kind} {index}{_name(content[kind][index])}"
+            return f" in [[{kind}]] {index + 1}{_name(content[kind][index])}"
         case ["dark", int(index), *_] if isinstance(content["dark"], list):
             return f" in [[dark]] {index + 1}"
         case ["sensor", "region", int(index), *_]:

@@ -43,7 +43,8 @@ def _table(
         if tables[name] is None:
             yield from _comment(f"{field.description} ({field.title})")
             given = values.get(name, BLANK if field.is_required() else None)
-            shown = example_of(field) if given is None else given
+            own = field.is_required() or field.default in (None, "")
+            shown = (example_of(field) if own else field.default) if given is None else given
             yield f"{'#' if given is None else ''}{name} = {_toml(shown)}"
     for name, table in tables.items():
         if table is not None:

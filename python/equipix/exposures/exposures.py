@@ -158,7 +158,7 @@ class Exposures(Measured):
     def name_of(self, exposure: int) -> str:
         """Return how messages name an exposure."""
         own = self.names[exposure] if self.names else ""
-        return f"exposure {exposure} ({repr(own) if own else 'from 0'})"
+        return f"exposure {own!r}" if own else f"exposure {exposure} (from 0)"
 
     def used(self, fit: Fit, exposure: int) -> Bools:
         """Return which measurements of an exposure a fit used: usable ones that it did not lose."""

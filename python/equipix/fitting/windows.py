@@ -20,6 +20,7 @@ from equipix.fitting.residuals import (
     EXACT,
     FEWEST,
     Correlation,
+    Residuals,
     in_blocks,
     lag_one,
     sampled,
@@ -233,6 +234,31 @@ def simulated_chi2(weighted: Weighted, options: FitOptions) -> Chi2 | None:
     .. [1] B. Efron, R. J. Tibshirani, "An Introduction to the Bootstrap" (1993), section 6.5: the
        parametric bootstrap.
     """
+    found = _of_noise(weighted, options)
+    if found is None:
+        return None
+    part, other, _ = found
+    free = tested(part.fit)
+    factor = squares(other.exposures, other.fit, free, options) / part.expected_misfit
+    left = squares(weighted.exposures, weighted.fit, tested(weighted.fit), options)
+    std = float(np.hypot(weighted.chi2_std, part.chi2_std))
+    return Chi2(left / factor / weighted.expected_misfit, std)
+
+
+@if_there_is_light()
+def simulated_neighbours(weighted: Weighted, options: FitOptions) -> tuple[Correlation, ...] | None:
+    """Correlation of neighbouring residuals of simulated noise on a central window, by axis.
+
+    The window has a larger share of edges than the whole sensor, so it is the larger.
+    """
+    found = _of_noise(weighted, options)
+    return None if found is None else lag_one(found[2].values, found[2].share)
+
+
+def _of_noise(
+    weighted: Weighted, options: FitOptions
+) -> tuple[Weighted, Weighted, Residuals] | None:
+    """A central window, the fit of simulated noise there and its residuals, if exact enough."""
     # Coordinate descent would take thousands of sweeps for large-scale errors of this fit alone.
     options = dataclasses.replace(options, progress=None, method="multiscale")
     window, fit = window_of(weighted.exposures, weighted.fit)
@@ -241,14 +267,9 @@ def simulated_chi2(weighted: Weighted, options: FitOptions) -> Chi2 | None:
         part = with_dark_misfit(Weighted(window, window.fit(options), None), Options(options))
     right = simulated(part, options)
     other = Weighted(right, right.fit(options, part.fit), None)
-    exact = sampled(other, workers=options.workers).inexactness <= EXACT
-    if part.fit.degrees_of_freedom < FEWEST or not exact:
-        return None
-    free = tested(part.fit)
-    factor = squares(right, other.fit, free, options) / part.expected_misfit
-    left = squares(weighted.exposures, weighted.fit, tested(weighted.fit), options)
-    std = float(np.hypot(weighted.chi2_std, part.chi2_std))
-    return Chi2(left / factor / weighted.expected_misfit, std)
+    residuals = sampled(other, workers=options.workers)
+    exact = residuals.inexactness <= EXACT
+    return (part, other, residuals) if part.fit.degrees_of_freedom >= FEWEST and exact else None
 
 
 def simulated(part: Weighted, options: FitOptions, sign: int = 1) -> Exposures:

@@ -9,7 +9,15 @@ import numpy as np
 
 from equipix._check import Array
 from equipix.errors import FileError
-from equipix.hardware.table_files import Content, header, made, memories, read_header
+from equipix.hardware.table_files import (
+    Content,
+    checksum,
+    header,
+    in_words,
+    made,
+    memories,
+    read_header,
+)
 from equipix.hardware.words import STEPS, Format
 
 _FIRST = "/* equipix table: "
@@ -38,17 +46,26 @@ _ROUNDING = "sum = (sum + {half} - 1 + ((sum >> {bits}) & 1)) >> {bits}; /* half
 
 
 def to_c_header(content: Content, name: str) -> bytes:
-    """Bytes of a file, whose C names begin with ``equipix_`` and its name."""
-    lower = "equipix_" + re.sub(r"\W", "_", name, flags=re.ASCII).lower()
-    upper = lower.upper()
+    """Bytes of a file, whose C names begin with ``equipix_`` and its name.
+
+    A letter beyond ASCII is written as its code point. Other characters become ``_``, so two names
+    may still be alike: a program that includes both files is then not compiled.
+    """
+    letters = re.sub(r"[^\x00-\x7f]", lambda letter: f"u{ord(letter[0]):04x}", name)
+    lower = "equipix_" + re.sub(r"\W", "_", letters).lower()
+    upper, crc = lower.upper(), f"0x{checksum(content):08x}"
     lines = [
         f"{_FIRST}{header(content)} */",
         f"#ifndef {upper}_H",
         f"#define {upper}_H",
+        f"#define {upper}_CRC32 ({crc})",
         "#include <stdint.h>",
         *_macros(content, upper),
+        "/* " + "\n   ".join(in_words(content)) + " */",
         *_arrays(content, lower),
         _function(content.format, lower),
+        f"#elif {upper}_CRC32 != {crc}",
+        f"#error another table has the names {lower}: write one to a file of another name",
     ]
     text = "\n".join([*lines, ""])
     return f"{text}{_last(upper, text)}\n".encode()

@@ -170,6 +170,26 @@ def refuse_far_offsets(
         )
 
 
+def refuse_far_lowest(found: Content, line: tuple[Floats, Floats], largest: float) -> None:
+    """Refuse a lowest value that no usable pixel gives for raw values up to the largest.
+
+    Raises
+    ------
+    InputError
+        With the range.
+    """
+    offset, gain = (each[usable(found.flags)] for each in line)
+    # Where the correction adds to all pixels, the output may begin at 0.
+    low, high = min(0.0, float(offset.min())), float((offset + gain * largest).max())
+    lowest = found.metadata["lowest"]
+    if not low <= lowest <= high:
+        raise InputError(
+            f"'lowest' is {lowest:g} DN, expected a corrected value from {low:g} to {high:g} DN, "
+            f"as raw values of the sensor, up to {largest:g} DN, have: choose some noise below the "
+            "darkest scene"
+        )
+
+
 def _places(pixels: Bools) -> str:
     """Name the first of some pixels."""
     places = [tuple(each) for each in np.argwhere(pixels).tolist()]
@@ -245,7 +265,7 @@ _STEPS = 65
 
 
 def line_of(
-    correction: Correction, linearise: tuple[float, float] | None
+    correction: Correction, linearise: tuple[float, float] | None, largest: float
 ) -> tuple[tuple[Floats, Floats], float]:
     """Offset and gain of each pixel, and the largest sag of a curve that a line replaces, in DN.
 
@@ -254,36 +274,41 @@ def line_of(
     Raises
     ------
     InputError
-        If the correction is curved and `linearise` is not given, or has no two rising values.
+        If the correction is curved and `linearise` is not given, or has no two rising raw values
+        up to the largest.
     """
     planes = np.asarray(correction.coefficients, np.float64)
     if len(planes) < 2:
-        raise InputError("'correction' has no gain, expected coefficients of order 1 or more")
+        raise InputError("'correction' has no gain, expected a polynomial of degree 1 or more")
     if linearise is None:
         if len(planes) > 2 and np.nan_to_num(planes[2:]).any():
             raise InputError(
-                f"'correction' is of order {len(planes) - 1}, but a table of gain and offset holds "
-                "order 1: fit a response of order 1, or give 'linearise' (--linearise), two raw "
-                "values in DN between which a straight line takes the place of the curve"
+                f"'correction' has degree {len(planes) - 1} in raw values, but a table of gain and "
+                "offset holds degree 1: fit a response of order 1, or give 'linearise' "
+                "(--linearise), two raw values in DN between which a straight line takes the place "
+                "of the curve"
             )
         return (planes[0], planes[1]), 0.0
-    return _chord(planes, usable(correction.flags), *check_range(linearise))
+    return _chord(planes, usable(correction.flags), *_checked_range(linearise, largest))
 
 
-def check_range(linearise: object) -> tuple[float, float]:
-    """Two rising raw values.
+def _checked_range(linearise: object, largest: float) -> tuple[float, float]:
+    """Two rising raw values that the sensor has.
 
     Raises
     ------
     InputError
-        If there are not two, or they do not rise.
+        If there are not two, they do not rise, or are out of range.
     """
-    problem = f"'linearise' is {linearise!r}, expected two rising raw values in DN"
+    problem = (
+        f"'linearise' is {linearise!r}, expected two rising raw values in DN from 0 to "
+        f"{largest:g}, the largest raw value of the sensor"
+    )
     try:
         low, high = (float(each) for each in linearise)  # type: ignore[attr-defined]
     except (TypeError, ValueError) as error:
         raise InputError(problem) from error
-    if not (np.isfinite([low, high]).all() and low < high):
+    if not 0 <= low < high <= largest:
         raise InputError(problem)
     return low, high
 

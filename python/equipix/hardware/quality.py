@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import takewhile
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -13,7 +13,8 @@ from equipix.correction.protocol import Correction
 from equipix.errors import InputError, InputWarning
 from equipix.findings import usable
 from equipix.hardware.table import Table
-from equipix.metrics import correctability
+from equipix.measured.colour import Colours
+from equipix.metrics import correctability, planes
 from equipix.metrics.correctability import Correctability
 from equipix.shown import Brief
 
@@ -23,6 +24,14 @@ _BOTH = 16
 """Width of the words that are not varied."""
 
 
+class Cost(NamedTuple):
+    """C of the correction and of its table, and what the words add; as of `Quality`."""
+
+    before: Correctability
+    after: Correctability
+    added: float
+
+
 @dataclass(frozen=True)
 class Quality(Brief):
     """Quality C of a correction and of its table, the result of `quality`.
@@ -30,14 +39,20 @@ class Quality(Brief):
     Attributes
     ----------
     before, after : Correctability
-        C of the correction in floating point, and of the table.
+        C of the correction in floating point, and of the table; behind colour filters those of the
+        plane that `worst` names.
     added : float
         Spatial noise that the words add, over the temporal noise: the rms over the pixels of the
-        difference of both mean images, less its mean.
+        difference of both mean images, less its mean. Of the same plane.
     at_ends : int
         Words of usable pixels at either end of the ADC, probably beyond it.
     table : Table
         The table.
+    worst : str
+        The plane of `equipix.metrics.planes` to which the words add most; "" where the correction
+        names no colour filters.
+    planes : dict
+        The first three of each plane, by its name.
     """
 
     before: Correctability
@@ -45,6 +60,8 @@ class Quality(Brief):
     added: float
     at_ends: int
     table: Table
+    worst: str
+    planes: dict[str, Cost]
 
 
 @naming_memory("quality of a table")
@@ -73,6 +90,7 @@ def quality(correction: Correction, frames: ArrayLike, **options: Any) -> Qualit
     Notes
     -----
     Of the table nothing is warned: what it costs is the result, and `Table.findings` has the rest.
+    Behind colour filters each plane is judged by itself, as colours differ in level.
 
     Examples
     --------
@@ -87,14 +105,17 @@ def quality(correction: Correction, frames: ArrayLike, **options: Any) -> Qualit
     >>> narrow.added > 10 * wide.added
     True
     """
-    raw, exact, before = _level("frames", correction, frames)
+    level = _Level.of("frames", correction, frames)
     with warnings.catch_warnings(action="ignore", category=InputWarning):  # what words cost is told
         table = Table.of(correction, **options)
-    words = table.digitise(raw)[:, usable(table.flags)]
+    words = table.digitise(level.raw)[:, usable(table.flags)]
     at_ends = int(np.count_nonzero((words == 0) | (words == table.format.largest_word)))
-    _refuse_clipped(raw, table, words, at_ends)
-    found = table.correct(raw)
-    return Quality(before, correctability(found), _added(found, exact, before), at_ends, table)
+    _refuse_clipped(level.raw, table, words, at_ends)
+    found = table.correct(level.raw)
+    added, after = level.added(found), level.judged(found)
+    costs = {name: Cost(level.before[name], after[name], added[name]) for name in added}
+    worst = max(added, key=added.__getitem__)
+    return Quality(*costs[worst], at_ends, table, worst, costs)
 
 
 def _refuse_clipped(raw: Array, table: Table, words: Array, at_ends: int) -> None:
@@ -109,10 +130,37 @@ def _refuse_clipped(raw: Array, table: Table, words: Array, at_ends: int) -> Non
         )
 
 
-def _added(found: Array, exact: Array, before: Correctability) -> float:
-    """Spread over the pixels of what the words change, over the temporal noise."""
-    change = (found.astype(np.float64) - exact).mean(axis=0)
-    return float(np.std(change[np.isfinite(change)]) / np.sqrt(before.temporal_variance))
+class _Level(NamedTuple):
+    """Frames of one level, the same corrected in floating point, and C of each plane of these."""
+
+    raw: Array
+    exact: Array
+    colours: Colours | None
+    before: dict[str, Correctability]
+
+    @classmethod
+    def of(cls, name: str, correction: Correction, frames: ArrayLike) -> Self:
+        raw = as_array(name, frames, ndim=3)
+        level = cls(raw, correction.correct(raw, flagged="nan"), correction.colours, {})
+        return level._replace(before=level.judged(level.exact))
+
+    def planes(self, frames: Array) -> dict[str, Array]:
+        """Each plane of colour filters by its name, or all pixels under no name."""
+        return {"": frames} if self.colours is None else planes(frames, self.colours)
+
+    def judged(self, frames: Array) -> dict[str, Correctability]:
+        """C of each plane."""
+        return {name: correctability(plane) for name, plane in self.planes(frames).items()}
+
+    def added(self, found: Array) -> dict[str, float]:
+        """Spread over the pixels of what the words change, over the temporal noise."""
+        change = (found.astype(np.float64) - self.exact).mean(axis=0)
+        return {
+            name: float(
+                np.std(plane[np.isfinite(plane)]) / np.sqrt(self.before[name].temporal_variance)
+            )
+            for name, plane in self.planes(change).items()
+        }
 
 
 @dataclass(frozen=True)
@@ -128,12 +176,16 @@ class Widths(Brief):
     added : dict
         By ``"offset"``, ``"gain"`` and ``"both"``, what each width from 8 to 16 bits adds at the
         worst level, over the temporal noise; infinite where words of usable pixels do not fit.
+    worst : dict
+        By the same names, the number of the level and the plane of colour filters to which the
+        width that suffices adds most, or 16 bits where none does; the plane is "" without filters.
     """
 
     offset_bits: int | None
     gain_bits: int | None
     both_bits: int | None
     added: dict[str, dict[int, float]]
+    worst: dict[str, tuple[int, str]]
 
 
 @naming_memory("widths of a table")
@@ -147,7 +199,8 @@ def smallest_widths(
     correction : Correction
         The correction.
     levels : sequence of array_like, shape (n, rows, cols) each
-        Raw frames of steady even levels; the worst one counts.
+        Raw frames of steady even levels; the worst one counts, and behind colour filters the worst
+        plane.
     added : float
         Largest spatial noise that the words may add, over the temporal noise. 0.1 raises a C of 1
         to 1.005.
@@ -168,17 +221,21 @@ def smallest_widths(
     sought = {"offset_bits", "gain_bits"} & set(options)
     if sought or not len(levels):
         raise InputError(f"{sorted(sought) or 'levels'}: expected levels, and no width of a memory")
-    measured = [_level("levels", correction, frames) for frames in levels]
+    measured = [_Level.of("levels", correction, frames) for frames in levels]
 
-    def worst(offset_bits: int, gain_bits: int) -> float:
-        """Most that words add over all levels; infinite where those of usable pixels do not fit."""
+    def worst(offset_bits: int, gain_bits: int) -> tuple[float, tuple[int, str]]:
+        """Most that words add, and where; infinite where those of usable pixels do not fit."""
         widths: dict[str, Any] = {"offset_bits": offset_bits, "gain_bits": gain_bits}
         try:
             table = Table.of(correction, **widths, **options)
         except InputError:
             # With 16 bits they fit.
-            return float("inf")
-        return max(_added(table.correct(raw), exact, before) for raw, exact, before in measured)
+            return float("inf"), (0, "")
+        return max(
+            (each, (number, plane))
+            for number, level in enumerate(measured)
+            for plane, each in level.added(table.correct(level.raw)).items()
+        )
 
     with warnings.catch_warnings(action="ignore", category=InputWarning):
         Table.of(correction, offset_bits=_BOTH, gain_bits=_BOTH, **options)
@@ -187,17 +244,11 @@ def smallest_widths(
             "gain": {bits: worst(_BOTH, bits) for bits in _WIDTHS},
             "both": {bits: worst(bits, bits) for bits in _WIDTHS},
         }
-    offset, gain, both = (_first(each, added) for each in found.values())
-    return Widths(offset, gain, both, found)
-
-
-def _level(
-    name: str, correction: Correction, frames: ArrayLike
-) -> tuple[Array, Array, Correctability]:
-    """Frames of one level, the same corrected in floating point, and their C."""
-    raw = as_array(name, frames, ndim=3)
-    exact = correction.correct(raw, flagged="nan")
-    return raw, exact, correctability(exact)
+    costs = {name: {bits: each for bits, (each, _) in of.items()} for name, of in found.items()}
+    enough = {name: _first(of, added) for name, of in costs.items()}
+    where = {name: found[name][bits or _BOTH][1] for name, bits in enough.items()}
+    offset, gain, both = enough.values()
+    return Widths(offset, gain, both, costs, where)
 
 
 def _first(found: dict[int, float], limit: float) -> int | None:

@@ -14,7 +14,14 @@ from equipix.correction.protocol import Correction, Dark, check_correction, with
 from equipix.errors import InputError
 from equipix.findings import Finding, say, usable
 from equipix.hardware import c_header, table_files
-from equipix.hardware.encode import Steps, encode, line_of, origin, refuse_far_offsets
+from equipix.hardware.encode import (
+    Steps,
+    encode,
+    line_of,
+    origin,
+    refuse_far_lowest,
+    refuse_far_offsets,
+)
 from equipix.hardware.table_files import Content
 from equipix.hardware.words import (
     NARROWEST,
@@ -151,24 +158,25 @@ class Table(RawCorrection, Content):
         lowest : float
             Corrected value in DN that the ADC must still see: the DAC subtracts no more than
             leaves each pixel a word of 0 there, and the output 0 stands for it. Choose it some
-            noise below the darkest scene.
+            noise below the darkest scene, within the corrected values of the sensor's raw values.
         linearise : tuple of float, optional
-            Two raw values in DN. Between them a straight line replaces a correction of order 2 or
-            3. It is parallel to the chord, and half of the sag away on either side:
-            ``metadata["linearised"]`` has the largest sag, the range of the deviations from the
-            chord at 65 raw values.
+            Two raw values in DN of the sensor's range. Between them a straight line replaces a
+            correction of order 2 or 3. It is parallel to the chord, and half of the sag away on
+            either side: ``metadata["linearised"]`` has the largest sag, the range of the deviations
+            from the chord at 65 raw values.
 
         Returns
         -------
         Table
-            Its ``metadata["largest_error_dn"]`` bounds the error of rounded words, the rounding
-            of the ADC and of the output aside.
+            Its ``metadata["largest_error_dn"]`` bounds the error of rounded gains and offsets. Half
+            a step of the output, and half a step of the ADC times the gain, come beside it.
 
         Raises
         ------
         InputError
-            If a width or a step is out of range, the correction is curved, or words of usable
-            pixels do not fit; the message has their number and the width that would hold them.
+            If a width, a step or another value is out of range, the correction is curved, or words
+            of usable pixels do not fit; the message has their number and the width that would hold
+            them.
 
         Warns
         -----
@@ -194,8 +202,10 @@ class Table(RawCorrection, Content):
             adc + widths["adc_bits"] - widths["out_bits"] if out is None else out,
         )
         with naming_memory("making a table"):
-            line, sag = line_of(correction, linearise)
+            largest = _largest_raw(correction, adc)
+            line, sag = line_of(correction, linearise, largest)
             found = encode(line, correction.flags, widths, steps, float(lowest))
+            refuse_far_lowest(found, line, largest)
             refuse_far_offsets(found, line, widths, steps, float(lowest))
         colours, source = correction.colours, origin(correction)
         depth = correction.bits if source.get("sensor", {}).get("bit_depth") else 0
@@ -334,7 +344,7 @@ class Table(RawCorrection, Content):
         """
         file = as_path("path", path)
         if file.suffix.lower() in IMAGES:
-            text = "\n".join(self.format.words)
+            text = "\n".join(self.format.gain_words)
             with write_whole(path, force=force) as temporary:
                 tiff.write_frames(temporary, [self.gain], nbytes=0, description=text)
             return
@@ -342,6 +352,12 @@ class Table(RawCorrection, Content):
         data = encode_file(self, file.stem)
         with write_whole(path, force=force) as temporary:
             temporary.write_bytes(data)
+
+
+def _largest_raw(correction: Correction, adc: int) -> float:
+    """Largest raw value in DN: of the sensor's bits, where unknown of an ADC of most bits."""
+    bits = correction.bits
+    return float(2**bits - 1 if bits else np.ldexp(2.0**WIDEST - 1, adc))
 
 
 def _limits(made: Content, depth: int) -> tuple[Finding, ...]:

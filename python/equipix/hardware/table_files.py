@@ -9,7 +9,7 @@ multiple of 16 bytes, so that a loader can map it; zeros fill the gaps.
 
 Memory images are text for ``$readmemh``, one word a pixel. From the highest bit down a word is the
 coarse offset, the fine offset in two's complement, and the gain; the address is row · cols + col.
-Comments at the top state the formula. Flags of a pixel follow its word as a comment.
+Comments at the top state the formula and the order. Flags of a pixel follow its word as a comment.
 """
 
 import json
@@ -23,7 +23,7 @@ import numpy as np
 
 from equipix._check import Array, ReadOnly
 from equipix.errors import FileError, InputError
-from equipix.findings import usable
+from equipix.findings import Flag, usable
 from equipix.hardware.words import Format
 
 NEWEST = 1
@@ -209,6 +209,18 @@ def _stored(widths: Format) -> dict[str, np.dtype[np.generic]]:
     return found
 
 
+def in_words(content: Content) -> tuple[str, ...]:
+    """Where the words of a pixel are, how many pixels must not be used, and what flags mean."""
+    rows, cols = content.gain.shape
+    bits = ", ".join(f"{flag:08x} {flag.name}" for flag in Flag)
+    return (
+        f"{rows} rows of {cols} pixels, row by row: {rows * cols} pixels. The first is that of",
+        "   row 0, column 0, which viewers show at the upper left of a TIFF or PNG.",
+        f"{np.count_nonzero(content.gain == 0)} pixels must not be used; all their words are 0.",
+        f"flags of a pixel, hexadecimal, are the sum of {bits}.",
+    )
+
+
 _FIRST = "// equipix table: "
 
 
@@ -218,8 +230,15 @@ def to_memory_image(content: Content, _name: str) -> bytes:
     offset = content.offset.astype(np.int64) & (2**f.offset_bits - 1)
     packed = (content.coarse.astype(np.int64) << f.offset_bits | offset) << f.gain_bits
     packed |= content.gain
-    digits = -(-sum(f.stored.values()) // 4)
-    lines = [f"{_FIRST}{header(content)}", *(f"// {line}" for line in (*f.words, _fields(f)))]
+    width = sum(f.stored.values())
+    digits = -(-width // 4)
+    said = (
+        "A line below is the word of a pixel, and behind it as a comment its flags, if any.",
+        f"{packed.size} words of {width} bits, {digits} hexadecimal digits each.",
+        _fields(f),
+    )
+    comments = [f"// {line}" for line in (*f.words, *in_words(content), *said)]
+    lines = [f"{_FIRST}{header(content)}", *comments]
     for word, flags in zip(packed.flat, content.flags.flat, strict=True):
         lines.append(f"{word:0{digits}x}" + (f" // {flags:08x}" if flags else ""))
     return "\n".join([*lines, ""]).encode()

@@ -112,8 +112,16 @@ class Format:
             f"   rounded half to even, limited to 0 to {2**self.out_bits - 1}.",
             f"corrected value in DN: (z + {self.zero}) * 2^{self.out}",
             f"{dac}offset: {self.offset_bits} bits, two's complement.",
+            *self.gain_words,
+            "   Its z is 0.",
+        )
+
+    @property
+    def gain_words(self) -> tuple[str, ...]:
+        """What the words of the gain stand for, line by line."""
+        return (
             f"gain: {self.gain_bits} bits, unsigned, in steps of 2^{self.gain}.",
-            "gain 0: do not use this pixel; its z is 0.",
+            "gain 0: do not use this pixel.",
         )
 
     @property

@@ -83,7 +83,10 @@ def _opened(path: Path) -> Iterator[Any]:
     try:
         opened = rawpy.imread(str(path))
     except rawpy.LibRawError as error:
-        raise FileError(f"{path}: cannot be read: {error.args[0].decode()}") from error
+        raise FileError(
+            f"{path}: is no {path.suffix} file of a camera that LibRaw reads, or damaged: use "
+            f"a copy (LibRaw: {error.args[0].decode()})"
+        ) from error
     with opened as raw:
         if raw.raw_type != rawpy.RawType.Flat:
             raise FileError(f"{path}: holds several values in each pixel, expected one")

@@ -137,7 +137,9 @@ def load_pages(path: str | PathLike[str]) -> tuple[dict[str, Array], dict[str, A
     metadata = _parsed(text)
     if _CRC not in metadata:
         raise FileError(
-            f"{path}: holds neither a correction nor frame statistics: equipix did not write it"
+            f"{path}: holds neither a correction nor frame statistics: equipix did not write it, "
+            "or wrote it for other programs alone, as gains of a table: name the result itself. "
+            "Images are for equipix average, or for equipix calibrate in an experiment.toml"
         )
     if metadata.pop(_CRC) != _checksum(metadata):
         raise FileError(

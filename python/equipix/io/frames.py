@@ -160,6 +160,18 @@ def settings(path: Path) -> Settings:
         return Settings(tiff.exposure_s(path) if suffix in (".tif", ".tiff") else None)
 
 
+_SAME = 0.01
+"""Relative difference of exposure times that are the same: EXIF and people round them."""
+
+
+def apart(index: int, one: float | None, other: float | None, tolerance: float) -> bool:
+    """Whether two exposure times, or with index 1 temperatures, are known and differ."""
+    if one is None or other is None:
+        return False
+    limit = tolerance if index else _SAME * max(one, other)
+    return abs(one - other) > limit + 1e-9 * abs(one)
+
+
 class Header(NamedTuple):
     """Shape (n, rows, cols) and dtype of the frames of a file, and the text stored with them."""
 

@@ -114,13 +114,19 @@ def reading(path: Path) -> Iterator[None]:
     logger.addHandler(complaints)
     try:
         yield
-    except FileNotFoundError as error:
-        raise FileError(f"{path}: does not exist") from error
     except Exception as error:
+        # Also where a library is missing.
+        if isinstance(error, FileNotFoundError) or not split(path)[0].exists():
+            raise FileError(f"{path}: does not exist") from error
         # Values out of range are a fault of the file; no memory, or no library, is not.
-        if isinstance(error, EquipixError) and not isinstance(error, InputError):
+        is_fault = not isinstance(error, EquipixError) or isinstance(error, InputError)
+        if isinstance(error, FileNotFoundError) or not (is_fault or path.exists()):
+            raise FileError(f"{path}: does not exist") from error
+        if not is_fault:
             raise
         broken = f"incomplete, damaged, or no {path.suffix} file: use a copy, or make it again"
+        if _is_text(path):
+            broken += " (it holds text)"
         codecs = f"{error}; pip install 'equipix[codecs]'" if "imagecodecs" in str(error) else ""
         why = codecs or getattr(error, "strerror", None) or broken
         raise FileError(f"{path}: cannot be read: {why}") from error
@@ -128,6 +134,14 @@ def reading(path: Path) -> Iterator[None]:
         logger.removeHandler(complaints)
     if complaints.messages:
         raise FileError(f"{path}: is broken: {complaints.messages[0]}")
+
+
+def _is_text(path: Path) -> bool:
+    """Whether a file begins with text; FITS and HDF5 begin with names of their own."""
+    with suppress(OSError), split(path)[0].open("rb") as file:
+        start = file.read(80)
+        return bool(start) and start.isascii() and not start.startswith((b"SIMPLE", b"%"))
+    return False
 
 
 class _Complaints(logging.Handler):

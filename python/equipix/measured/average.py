@@ -26,10 +26,12 @@ from equipix._check import (
 from equipix.errors import FileError, InputError
 from equipix.io.formats import ONLY_RESULTS
 from equipix.io.frames import (
+    apart,
     check_image,
     frame_format,
     is_image,
     leaving_others,
+    settings,
     stream_frames,
 )
 from equipix.io.paths import find_files
@@ -87,7 +89,8 @@ def average(
     InputError
         If an argument has a wrong shape or value, or no frame holds a finite number.
     FileError
-        If a file is missing, broken, in colour, or differs from the first in shape or depth.
+        If a file is missing, broken, in colour, or differs from the first in shape or depth; if
+        headers or EXIF of files hold different exposure times.
     InsufficientMemoryError
         If there is not enough memory; on Linux this is checked before the work starts.
 
@@ -179,6 +182,7 @@ def _average_files(names: list[Any], how: _How) -> FrameStatistics:
     paths = find_files(names)
     LOG.info("files to average: %d, the first %s", len(paths), paths[0])
     LOG.debug("reads %s", ", ".join(map(str, paths)))
+    _refuse_mixed(paths)
     if any(path.suffix.lower() in ONLY_RESULTS for path in paths):
         return _saved(paths, how)
     if how.rejection is None and all(map(is_image, paths)):
@@ -194,6 +198,19 @@ def _average_files(names: list[Any], how: _How) -> FrameStatistics:
     stream = stream_frames(paths, workers=how.workers)
     given = batches(frame for _, frames in stream for frame in frames)
     return _average_batches(given, how, len(paths))
+
+
+def _refuse_mixed(paths: list[Path]) -> None:
+    """Refuse files of different exposure times, where they hold them."""
+    if len(paths) < 2:
+        return
+    times = {path: time for path in paths if (time := settings(path).exposure_s) is not None}
+    least, most = (choose(times, key=times.__getitem__, default=None) for choose in (min, max))
+    if least and most and apart(0, times[least], times[most], 0.0):
+        raise FileError(
+            f"'{least}' holds the exposure time {times[least]:g} s, '{most}' {times[most]:g} s, "
+            "expected one: average the frames of each exposure time by themselves"
+        )
 
 
 def _saved(paths: list[Path], how: _How) -> FrameStatistics:

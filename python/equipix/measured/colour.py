@@ -256,7 +256,9 @@ def advice(colours: Colours) -> str:
     """Say which 'cfa' to write for a pattern that values show."""
     named = _bayer(colours)
     write = " or ".join(f"cfa={each!r}" for each in named or [str(colours)])
-    return f"write {write}{', whichever the data sheet names' if named else ''}"
+    return (
+        f"write {write} (in [sensor] of a manifest){', as the data sheet has it' if named else ''}"
+    )
 
 
 def mean_signal(values: Array, mask: Bools | None = None) -> tuple[Floats, tuple[int, int]]:

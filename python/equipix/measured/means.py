@@ -1,11 +1,12 @@
 """Averages of exposures or levels, reduced one by one."""
 
 import copy
+import dataclasses
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, reduce
-from itertools import combinations_with_replacement
+from functools import cached_property
+from itertools import product
 from typing import Self
 
 import numpy as np
@@ -211,16 +212,36 @@ class Averaged:
 
         None without scatter: of single frames, and of equal ones that are not rounded.
         """
-        points = [each - (self.pedestal, 0, 0) for each in self._points]
+        more = [self._more_noise(shares) for shares in self._shares]
+        pairs = zip(self._points, more, strict=True)
+        points = [each - (self.pedestal, added, 0) for each, added in pairs]
         known = any(map(len, points))
-        for dark in self.darks:
-            signal, free = np.zeros(dark.mean.shape), dark.saturated == 0
-            points.append(_points(dark, signal, free, light_of(dark)))
-            known |= self.gain is not None and len(points[-1]) > 0
+        for each, added in zip(self._dark_points, self._beside_least, strict=True):
+            points.append(each - (0, added, 0))
+            known |= self.gain is not None and len(each) > 0
         every = np.concatenate(points)
         if not known or (self.step == 0 and not every[:, 1].any()):
             return None
         return NoiseModel.fit(every, gain=self.gain, step=self.step)
+
+    @cached_property
+    def _dark_points(self) -> list[Array]:
+        """Points of the photon-transfer curve of each dark, at signal 0."""
+        free = (each.saturated == 0 for each in self.darks)
+        pairs = zip(self.darks, free, strict=True)
+        return [_points(d, np.zeros(d.mean.shape), usable, light_of(d)) for d, usable in pairs]
+
+    @cached_property
+    def _beside_least(self) -> list[float]:
+        """Variance of a frame of each dark above the least: dark current has photon noise, too."""
+        if not all(map(len, self._dark_points)):
+            return [0.0] * len(self.darks)
+        found = [float(np.average(v, weights=f)) for _, v, f in (p.T for p in self._dark_points)]
+        return [each - min(found) for each in found]
+
+    def _more_noise(self, shares: tuple[float, ...]) -> float:
+        """Variance of a frame of an exposure above that of the noise model, by its dark."""
+        return sum(a * b for a, b in zip(shares, self._beside_least, strict=True))
 
     @property
     def dark(self) -> FrameStatistics | None:
@@ -258,8 +279,8 @@ class Averaged:
         """
         _, own = self._dark_variances(noise)
         return tuple(
-            noise.of_mean(each, dark_variance=dark_variance + more)
-            for each, more in zip(self.frames, own, strict=True)
+            _noisier(noise, self._more_noise(shares)).of_mean(each, dark_variance=dark_variance + v)
+            for each, v, shares in zip(self.frames, own, self._shares, strict=True)
         )
 
     def dark_variance(self, noise: NoiseModel) -> Floats | None:
@@ -275,12 +296,14 @@ class Averaged:
     def _dark_variances(self, noise: NoiseModel) -> tuple[Floats | None, list[float]]:
         """Variance of darks that counts as common to all exposures, and what each has beside it.
 
-        Darks Σ s D of two exposures have the covariance Σ s s' var(D). The largest of any two
-        exposures counts as that of all: the error of M is then not understated.
+        Darks Σ s D of two exposures have the covariance Σ s s' var(D). Its mean over all pairs
+        counts as that of all: where exposures have equal weights, the error of M and F are those of
+        the darks.
         """
         if not self.darks:
             return None, [0.0] * len(self.frames)
-        variances = [_variance_of_dark(each, noise) for each in self.darks]
+        pairs = zip(self.darks, self._beside_least, strict=True)
+        variances = [_variance_of_dark(each, _noisier(noise, more)) for each, more in pairs]
 
         def covariance(one: tuple[float, ...], other: tuple[float, ...]) -> Floats:
             triples = zip(one, other, variances, strict=True)
@@ -290,8 +313,13 @@ class Averaged:
         if len(counts) == 1:
             (shares,) = counts
             return covariance(shares, shares), [0.0] * len(self.frames)
-        pairs = combinations_with_replacement(counts, 2)
-        common = reduce(np.maximum, (covariance(a, b) for a, b in pairs if a != b or counts[a] > 1))
+        pairs_of_all = len(self.frames) * (len(self.frames) - 1)
+        common = np.asarray(
+            sum(
+                counts[a] * (counts[b] - (a == b)) / pairs_of_all * covariance(a, b)
+                for a, b in product(counts, repeat=2)
+            )
+        )
         beside = {each: np.maximum(covariance(each, each) - common, 0) for each in counts}
         own = {each: float(np.nanmedian(variance)) for each, variance in beside.items()}
         return common, [own[each] for each in self._shares]
@@ -300,6 +328,7 @@ class Averaged:
         """Bad pixels found before any fit; `noise` is the model of one frame, if known."""
         noisy = None
         if noise is not None:
+            noise = _noisier(noise, max(self._beside_least, default=0.0))
             light = map(Light.variance, self.light, self.values)
             noisy = defects.noisy_pixels(self._signals, self.variances, self.frames, noise, light)
             if self._screened:
@@ -353,6 +382,11 @@ def _added_by_dark(frames: FrameStatistics, count: int) -> float:
     return max(0.0, float(np.nanmedian(frames.variance_of_mean - frames.variance / count)))
 
 
+def _noisier(noise: NoiseModel, added: float) -> NoiseModel:
+    """Noise model with so much more variance without light."""
+    return dataclasses.replace(noise, read_noise=float(np.sqrt(noise.read_noise**2 + added)))
+
+
 def _variance_of_dark(dark: FrameStatistics, noise: NoiseModel) -> Floats:
     """Variance of the mean of dark frames, from the noise of one frame.
 
@@ -363,7 +397,7 @@ def _variance_of_dark(dark: FrameStatistics, noise: NoiseModel) -> Floats:
     of_frame = _between_neighbours(dark.mean) if is_one else noise.scatter(0.0)
     scatter = of_frame / np.maximum(dark.count, 1)
     of_mean = noise.of_mean(int(dark.count.max()))
-    return np.asarray(scatter + of_mean.rounding_apart(0.0, dark.mean))
+    return np.asarray(scatter + of_mean.rounding_apart(0.0, dark.mean, raw=True))
 
 
 def _between_neighbours(frame: Array) -> float:

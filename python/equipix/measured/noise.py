@@ -135,21 +135,26 @@ class NoiseModel(Brief):
             return np.zeros(())
         return self.step**2 * unaveraged(self._in_steps(signal))
 
-    def rounding_apart(self, signal: float, means: Array) -> float:
+    def rounding_apart(self, signal: float, means: Array, *, raw: bool = False) -> float:
         """Part of the rounding B that differs between pixels of one signal, with these means.
 
-        Where the means are less than a step apart pixels have a part of it in common.
+        Where the means are less than a step apart pixels have a part of it in common. If they are
+        `raw`, no dark subtracted, they show where in a step they lie.
         """
         every = float(self.rounding(signal))
         if every == 0:
             return 0.0
-        off = np.abs(means - np.nanmedian(means))
-        near = off[off <= _FAR * max(self.step, float(np.nanmedian(off)))]
-        between = float(np.mean(near**2)) / self.step**2
+        middle = float(np.nanmedian(means))
+        off = (means - middle) / self.step
+        near = off[np.abs(off) <= _FAR * max(1.0, float(np.nanmedian(np.abs(off))))]
+        between = float(np.mean(near**2))
         if between > 1:
             return every
         of_noise = float(self.scatter(signal)) / self.frames / self.step**2
         v = float(self._in_steps(signal))
+        if raw:
+            place = middle / self.step + float(near.mean())
+            return self.step**2 * unaveraged_at(v, place, float(near.var()) - of_noise)
         return self.step**2 * unaveraged_apart(v, between, of_noise)
 
     def largest_scatter(self, signal: ArrayLike) -> Array:
@@ -393,6 +398,15 @@ _GRID = 1001
 _LEAST_APART = 0.1
 """Least part of B that counts as different between pixels."""
 
+_PLACES = 256
+"""Places in a step, and spreads between 0 and one step, that are compared."""
+
+_LEAST_SEEN = 1e-4
+"""Least variance of noise in squared steps that they resolve."""
+
+_NEAR = 0.01
+"""Distance of a mean in steps, and relative one of a variance, at which they agree."""
+
 _FEWEST_VALUES = 8
 """Different values that must all be multiples of a step before it is one."""
 
@@ -473,6 +487,41 @@ def unaveraged_apart(v: float, between: float, of_noise: float) -> float:
     whole = float(unaveraged(v))
     left = whole - unaveraged(v + w)
     return max(_LEAST_APART * whole, float(np.interp(between - of_noise, w + left, left)))
+
+
+def unaveraged_at(v: float, mean: float, between: float) -> float:
+    """Variance between pixels of the rounding β of their means, at one place in a step, in q².
+
+    Parameters
+    ----------
+    v : float
+        Variance of the noise of one frame.
+    mean, between : float
+        Mean of the means, in steps, and their variance between pixels without their noise.
+
+    Notes
+    -----
+    Of light μ that is spread normally by w about m, the mean of a periodic f(μ) is that of f, each
+    wave k of it times exp(−2π²k²w). So m + ⟨β⟩ and w + 2w⟨β'⟩ + ⟨β²⟩ − ⟨β⟩², the mean and the
+    variance of the means, follow for all m and w, and those that agree with what was found give
+    ⟨β²⟩ − ⟨β⟩². On average over m that is `unaveraged_apart`.
+    """
+    k, m = np.arange(1, _PLACES // 2), np.arange(_PLACES) / _PLACES
+    # Noise of a hundredth of a step leaves waves that the grid of places holds.
+    waves = (-1.0) ** k / (np.pi * k) * np.exp(-2 * np.pi**2 * k**2 * max(v, _LEAST_SEEN))
+    angle = 2 * np.pi * np.multiply.outer(k, m)
+    beta, slope = waves @ np.sin(angle), (2 * np.pi * k * waves) @ np.cos(angle)
+    w = np.linspace(0, 1, _PLACES + 1)[:, None] ** 2
+    damped = np.exp(-2 * np.pi**2 * np.arange(_PLACES // 2 + 1) ** 2 * w)
+    mean_of, slope_of, square_of = (
+        np.fft.irfft(damped * np.fft.rfft(each)) for each in (beta, slope, beta**2)
+    )
+    apart = square_of - mean_of**2
+    off = np.remainder(m + mean_of - mean + 0.5, 1) - 0.5
+    wide = w + 2 * w * slope_of + apart - between
+    misfit = (off**2 + (wide / max(abs(between), _NEAR)) ** 2) / _NEAR**2 / 2
+    likely = np.exp(misfit.min() - misfit)
+    return float(np.sum(likely * apart) / likely.sum())
 
 
 def step_of(values: Array) -> float:

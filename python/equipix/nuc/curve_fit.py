@@ -16,7 +16,7 @@ from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.curves import horner_inverse, least_slope
 from equipix.nuc.level_rules import CURVES, INVERSE, Curves, inverse_error
 from equipix.nuc.levels import Levels, alike_pixels, levels_of
-from equipix.nuc.order import check_count, check_gain, check_order, chosen_order
+from equipix.nuc.order import check_count, check_gain, check_order, chosen_order, next_power
 from equipix.nuc.response import Response, common_misfit
 
 _MOST_MOVED = 0.01
@@ -87,8 +87,9 @@ def fit(
     InputWarning
         If the median of a level less the dark is below 0 by more than the noise of a value.
     MisfitWarning
-        If the noise is known, and half of the pixels have a reduced χ² above twice that of noise:
-        the order, if it is not 0, is too low, or the source was not steady.
+        If the noise is known, and curves of order 1 or 2 would be better with the next order: the
+        variance of its coefficient is above twice that by noise. For other causes, if half of the
+        pixels have a reduced χ² above twice that of noise.
     MisfitWarning
         If the cubic of orders 2 and 3 differs from the exact inverse by more than 0.3 of the noise
         of a frame at the lowest level, which adds 4 % to it, in more than 0.1 % of the usable
@@ -168,8 +169,23 @@ def fitted(
         found = ask(INVERSE, response)
         # One point is right at one level, whatever the others are; "auto" judged them all.
         if chosen > 0 or order == "auto":
-            found += ask(CURVES, Curves(response, common_misfit(response)))
+            misfit = common_misfit(response)
+            if order != "auto" and (len(given) - chosen - 1) * (misfit - 1) > 1:
+                response.metadata["next_power"] = _next_power(parts, chosen, workers)
+            found += ask(CURVES, Curves(response, misfit))
         return replace(response, findings=response.findings + say(*found))
+
+
+def _next_power(
+    parts: list[tuple[Bools, Levels]], order: int, workers: int | None
+) -> dict[str, float] | None:
+    """What `next_power` finds of the colour that most needs it; None where no levels give it."""
+    found = [
+        next_power(part, order, workers=workers)
+        for _, part in parts
+        if order < 3 and part.distinct() > order + 1
+    ]
+    return max(found, key=lambda each: each["ratio"], default=None)
 
 
 def _parts(levels: Levels) -> list[tuple[Bools, Levels]]:

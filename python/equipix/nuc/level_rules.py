@@ -275,11 +275,23 @@ def _on_large_noise(curves: Curves) -> str | None:
 def _on_misfit(curves: Curves) -> str | None:
     """Say that noise does not explain a misfit, and what to do."""
     response, misfit = curves
+    power, order = response.metadata.get("next_power"), response.order
+    levels = len(response.levels)
+    limit = max(_MOST, 1 + SIGMAS * power["standard_error"]) if power else 0.0
+    if power and power["ratio"] > limit:
+        auto = " or order='auto'" if order < levels - 2 else ""
+        return (
+            f"curves of order {order} do not follow the levels: their reduced chi-square is "
+            f"{misfit:.3g}, and the variance of the next coefficient is {power['ratio']:.3g} times "
+            f"that by noise (1 ± {power['standard_error']:.2g} of noise alone, limit {limit:.3g}): "
+            f"fit with order={order + 1}{auto}"
+        )
     if not misfit > _MOST:
         return None
-    order, levels = response.order, len(response.levels)
     higher = ""
-    if response.metadata["options"]["order"] == "auto":
+    if power:
+        higher = f"order {order + 1} explains no more of it than noise, so "
+    elif response.metadata["options"]["order"] == "auto":
         higher = "no other order predicts levels that are left out better, so "
     elif order < 3:
         more = "fit with" if order < levels - 2 else "give more levels and fit with"

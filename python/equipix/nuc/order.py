@@ -8,6 +8,7 @@ from equipix._check import Array, By, Floats, Order, check_word, described, is_w
 from equipix.errors import InputError
 from equipix.nuc.curves import response_at
 from equipix.nuc.levels import Levels, alike_pixels
+from equipix.nuc.response import typical
 
 HELD = 4
 """Most levels that are held out to choose an order."""
@@ -17,6 +18,9 @@ _BETTER = 1e-3
 
 _ROUNDING = 1e-9
 """Prediction error of exact data, relative to the largest level."""
+
+_MEDIAN_ERROR = 2.33
+"""Standard error of the median of N squares of a normal variable, over it, times √N."""
 
 
 def check_order(order: object, by: object) -> None:
@@ -92,6 +96,26 @@ def chosen_order(levels: Levels, by: By, *, workers: int | None) -> tuple[int, l
     errors = squares[:, alike].mean(axis=1).tolist()
     enough = min(errors) * (1 + _BETTER) + (_ROUNDING * np.abs(levels.references).max()) ** 2
     return next(order for order, error in enumerate(errors) if error <= enough), errors
+
+
+def next_power(levels: Levels, order: int, *, workers: int | None) -> dict[str, float]:
+    """Variance over pixels of the coefficient above an order, over that by noise; standard error.
+
+    Notes
+    -----
+    With a coefficient more the error of a pixel falls, summed over the levels in variances of a
+    value, by its square over its variance, and noise adds 1. So the next order is better where this
+    ratio is above 2. Pixels whose curves have this order give 1. The residuals of the next order
+    give the scale of the noise, so that noise that was understated has no part in it. What all
+    pixels have in common is of V̄, not of theirs.
+    """
+    deviation, variances, misfit, _ = levels.fit(order + 1, "offset", workers=workers)
+    coefficient, freedom = deviation[-1][levels.good], len(levels) - (order + 2)
+    squares = (coefficient - np.median(coefficient)) ** 2 / variances[-1][levels.good]
+    ratio = typical(squares, np.array(1))
+    if freedom > 0:
+        ratio /= typical(misfit[levels.good] / freedom, np.array(freedom))
+    return {"ratio": ratio, "standard_error": _MEDIAN_ERROR * float(np.sqrt(2 / squares.size))}
 
 
 def _squares(levels: Levels, held: Array, order: int, by: By, workers: int | None) -> Floats:

@@ -59,7 +59,8 @@ class Response(CorrectionBase, Record, kind="response", version=2):
     saturation : float or None
         Level of saturation in DN, where it is known.
     metadata : dict
-        Versions, options and times, as JSON values. With ``order="auto"`` the mean square error of
+        Versions, options and times, as JSON values. ``next_power`` holds the ratio by which the
+        next order was judged, where it was. With ``order="auto"`` the mean square error of
         prediction of each order. ``level_variances`` are those of a value at each level, in DN²; 1
         where no noise was known.
     cfa : Colours or None
@@ -267,17 +268,20 @@ def pattern_variance(response: Response, level: float) -> float:
     return float(np.mean(share * response.variances[-1][good] / slope[good] ** 2))
 
 
-def common_misfit(response: Response) -> float:
-    """Median over usable pixels of reduced χ², over the median that noise alone has.
+def typical(squares: Floats, freedom: Array) -> float:
+    """Median of mean squares of so many degrees of freedom, over the median that noise alone has.
 
-    At most its mean: where rounding is above the noise residuals have few different values, and
+    At most their mean: where rounding is above the noise residuals have few different values, and
     their median may be any of them.
     """
+    return float(min(np.median(squares / median_of_noise(freedom)), squares.mean()))
+
+
+def common_misfit(response: Response) -> float:
+    """Reduced χ² that usable pixels have in common, over that of noise alone."""
     if response.metadata.get("options", {}).get("weights") != "variances":
         return float("nan")
     judged = usable(response.flags) & (response.freedom > 0)
     if not judged.any():
         return float("nan")
-    noise = median_of_noise(response.freedom[judged])
-    chi2 = response.reduced_chi2[judged]
-    return float(min(np.median(chi2 / noise), chi2.mean()))
+    return typical(response.reduced_chi2[judged], response.freedom[judged])

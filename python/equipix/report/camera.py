@@ -12,6 +12,7 @@ from equipix._check import Floats
 from equipix.experiment.camera import CameraFigures
 from equipix.metrics.emva import QUANTISED, TRANSFER, Split, high_passed, linear_levels
 from equipix.report.drawing import draw_histogram, draw_spectrum
+from equipix.report.limits import CameraLimits, Check, checked
 from equipix.report.maps import Map
 from equipix.report.page import LARGEST, Part, Table, drawn, mapped, provenance_of
 
@@ -142,7 +143,12 @@ def _side_by_side(planes: dict[str, CameraFigures]) -> Table:
     return Table("Planes side by side", ("Figure", "Unit", *planes), rows_of(planes))
 
 
-def camera_parts(name: str, planes: dict[str, CameraFigures]) -> list[Part]:
+def camera_checks(found: CameraFigures, limits: CameraLimits) -> list[Check]:
+    """Judge the figures of a plane by limits."""
+    return checked(limits, {each.key: each.value for each in figures_of(found)}, found.findings)
+
+
+def camera_parts(name: str, planes: dict[str, CameraFigures], limits: CameraLimits) -> list[Part]:
     """Collect what a page says of a camera: a part for each plane of its colour filters."""
     largest, (first, *_), last = int(LARGEST / len(planes) ** 0.5), planes, [*planes][-1]
     parts = []
@@ -152,7 +158,7 @@ def camera_parts(name: str, planes: dict[str, CameraFigures]) -> list[Part]:
             name=f"{name}, plane {plane}" if plane else name,
             what=f"EMVA 1288 release 4.0 linear, {len(found.photons)} levels",
             findings=found.findings,
-            checks=[],
+            checks=camera_checks(found, limits),
             figures=_words_of(found),
             maps=[mapped(each, largest) for each in maps],
             plots=[*map(drawn, _curves(found, maps))],

@@ -108,7 +108,10 @@ def draw_map(axes: Axes, shown: Map) -> None:
     image = axes.imshow(
         values, vmin=low, vmax=high, cmap=CMAPS[shown.scale], extent=extent, interpolation="none"
     )
+    # Blocks at the edges may be smaller.
+    last_row, last_col = (shown.cell * size - 0.5 for size in shown.values.shape)
     axes.set(title=shown.title, xlabel=f"column\n{shown.words(step)}")
+    axes.set(xlim=(-0.5, last_col), ylim=(last_row, -0.5))
     axes.set_ylabel("row")
     axes.figure.colorbar(image, ax=axes, shrink=0.8)
 

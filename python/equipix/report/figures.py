@@ -14,6 +14,8 @@ from equipix.comparison import Comparison
 from equipix.correction.protocol import Correction, sensor_of
 from equipix.diagnosis.coverage import FAR
 from equipix.findings import Findings, Flag, usable
+from equipix.hardware.table import Table
+from equipix.hardware.words import STEPS
 from equipix.io.record import Record
 from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.response import Response, common_misfit
@@ -22,6 +24,9 @@ from equipix.scene.scene_correction import SceneCorrection
 
 _LEARNED = ("method", "data_range", "frames")
 """Keys of a scene's metadata that are shown."""
+
+_LAW = ("law", "centre", "focal_length", "k1", "k2", "std", "least_illumination")
+"""Keys of a lens's metadata that are shown."""
 
 
 def summary(content: Record | Correction | SceneCorrection | Comparison) -> dict[str, Any]:
@@ -47,10 +52,32 @@ def _of_correction(correction: Correction) -> dict[str, Any]:
     return {
         **known(sensor=sensor_of(correction)),
         "shape": list(correction.shape),
-        "order": len(correction.coefficients) - 1,
+        "degree": len(correction.coefficients) - 1,
+        **{name: correction.metadata[name] for name in _LAW if name in correction.metadata},
         **{f"scene_{name}": learned[name] for name in _LEARNED if name in learned},
         "flagged_pixels": flagged(correction),
         **told(correction.findings),
+    }
+
+
+def of_table(table: Table) -> dict[str, Any]:
+    """Collect the main figures of a table of words."""
+    f, linearised = table.format, table.metadata.get("linearised")
+    form = asdict(f)
+    return {
+        **known(sensor=sensor_of(table)),
+        "shape": list(table.shape),
+        "bits": {name.removesuffix("_bits"): form[name] for name in form if "_bits" in name},
+        "steps": {name: 2.0 ** form[name] for name in STEPS if name != "coarse" or f.dac_bits},
+        "base": f.base,
+        "zero": f.zero,
+        "unusable_pixels": int((~usable(table.flags)).sum()),
+        "flagged_pixels": flagged(table),
+        **known(largest_error_dn=table.metadata.get("largest_error_dn")),
+        "rounding_dn": (2.0**f.out + 2.0 ** (f.adc + f.gain) * int(table.gain.max())) / 2,
+        **({"sag_dn": linearised["sag_dn"]} if linearised else {}),
+        **known(correction_sha256=table.metadata.get("sha256")),
+        **told(table.findings),
     }
 
 
@@ -92,7 +119,7 @@ def _level_values(response: Response) -> dict[str, list[str]]:
         each["name"] if each["value"] is None else f"{each['value']:g} {each['unit'] or ''}"
         for each in levels
     ]
-    named = texts != [str(number) for number in range(len(levels))]
+    named = texts != [str(number + 1) for number in range(len(levels))]
     return {"level_values": [" ".join(each.split()) for each in texts]} if named else {}
 
 
@@ -112,10 +139,24 @@ def of_dynamic(correction: DynamicCorrection) -> dict[str, Any]:
         "bias_v": list(correction.axes.bias_v),
         "order": correction.axes.order,
         "bias_order": correction.axes.bias_order,
-        "gain_order": None if correction.gain is None else correction.gain_axes.order,
+        **_errors("offset_prediction_errors", correction.metadata.get("prediction_errors")),
+        **_gain(correction),
         "flagged_pixels": flagged(correction),
         **told(correction.findings),
     }
+
+
+def _gain(correction: DynamicCorrection) -> dict[str, Any]:
+    """Order of the gain and its errors, or what is not found without black bodies."""
+    if correction.gain is None:
+        return {"gain_order": None, "dead_pixels": "not determinable without black bodies"}
+    errors = correction.metadata.get("gain_prediction_errors")
+    return {"gain_order": correction.gain_axes.order, **_errors("gain_prediction_errors", errors)}
+
+
+def _errors(name: str, squares: list[float] | None) -> dict[str, list[float]]:
+    """Rms errors of the predictions of held-out temperatures, from order 0 on."""
+    return {} if squares is None else {name: np.sqrt(squares).tolist()}
 
 
 def of_scene(method: SceneCorrection) -> dict[str, Any]:
@@ -187,12 +228,14 @@ def _exposures(calibration: Calibration) -> Iterator[dict[str, Any]]:
     """Name, shift with its standard deviation where it is known, and flux of each exposure."""
     shifts, std = calibration.shifts, calibration.shift_std
     names = calibration.metadata.get("exposures", range(len(shifts)))
+    darks = calibration.metadata.get("darks", [""] * len(shifts))
     for number, name in enumerate(names):
         yield {
             "exposure": str(name),
             "shift": shifts[number].tolist(),
             "shift_std": None if std is None else std[number].tolist(),
             "flux": float(calibration.flux[number]),
+            "dark": darks[number] or None,
         }
 
 
@@ -277,6 +320,7 @@ _FIGURES: dict[type, Callable[[Any], dict[str, Any]]] = {
     Response: of_response,
     Comparison: of_comparison,
     DynamicCorrection: of_dynamic,
+    Table: of_table,
     **dict.fromkeys(METHODS.values(), of_scene),
 }
 """What collects the main figures of each kind of result."""
@@ -296,26 +340,50 @@ FIGURES = {
         "prediction errors, in variances of a level (DN² where no noise is known)",
         "",
     ),
+    "offset_prediction_errors": ("rms errors of predicted offsets, order 0 and up", "DN"),
+    "gain_prediction_errors": ("rms errors of predicted gains, order 0 and up, relative", ""),
     "variance_of_a_value": ("variance of a value", "DN²"),
     "largest_inverse_error": ("largest error of the inverse", "DN"),
+    "degree": ("degree of the correction in raw values", ""),
     "scene_data_range": ("range of the scene", "DN"),
     "floor_dn": ("floor of the pattern", "DN"),
     "offset_rms": ("rms of the offset", "DN"),
     "substrate_c": ("temperature of the substrate", "°C"),
     "bias_v": ("bias", "V"),
     "reduced_chi2": ("reduced χ²", ""),
+    "sweeps": ("passes over the data", ""),
+    "dark_frames": ("frames of the dark that belongs to it", ""),
+    "colour_response": ("mean response of each colour (M has mean 1 within each)", ""),
     "sensitivity_mean": ("mean of M", ""),
     "sensitivity_spread": ("spread of M", ""),
     "sensitivity_std": ("standard deviation of M, median", ""),
-    "sensitivity_std_is_exact_to": ("relative error of that", ""),
+    "sensitivity_std_is_exact_to": ("relative error of the standard deviation of M", ""),
     "tilt": ("tilt of M, edge to edge", ""),
     "tilt_std": ("standard deviation of the tilt", ""),
-    "error_estimate": ("error of M by the solver", ""),
+    "error_estimate": ("estimated error of M that the solver left", ""),
+    "centre": ("centre (row, col)", "pixels"),
+    "row": ("row", "pixels"),
+    "col": ("col", "pixels"),
+    "focal_length": ("focal length", "pixels"),
+    "k1": ("k1 of (r over half the diagonal)²", ""),
+    "k2": ("k2 of (r over half the diagonal)⁴", ""),
+    "std": ("standard errors", ""),
+    "least_illumination": ("least illumination, relative to the centre", ""),
+    "t": ("time t", ""),
+    "v": ("rows v", ""),
+    "h": ("columns h", ""),
+    "tv": ("rows and time tv", ""),
+    "th": ("columns and time th", ""),
+    "vh": ("pixels vh", ""),
+    "tvh": ("pixels and time tvh", ""),
     "spatial_variance": ("spatial variance", "DN²"),
     "temporal_variance": ("temporal variance", "DN²"),
     "noise_variances": ("variances of noise", "DN²"),
-    "steps": ("steps, that of the gain a ratio", "DN"),
-    "largest_error_dn": ("largest error", "DN"),
+    "steps": ("steps in DN, that of the gain a ratio", ""),
+    "base": ("output of the sum 0", "steps of the output"),
+    "zero": ("corrected value of the output 0", "steps of the output"),
+    "largest_error_dn": ("largest error of rounded gains and offsets", "DN"),
+    "rounding_dn": ("beside it, by rounding of ADC and output", "DN"),
     "sag_dn": ("sag of the line", "DN"),
 }
 """Names and units of figures; of all others the name is the key, and there is no unit."""
@@ -355,7 +423,11 @@ def _plain(value: Any) -> str:
             return _number(value, ".0f" if value.is_integer() and abs(value) < _WHOLE else ".4g")
         case dict():
             return (
-                ", ".join(f"{k} {in_words(each, _unit(k))}" for k, each in value.items()) or "none"
+                ", ".join(
+                    f"{FIGURES.get(k, (k,))[0]} {in_words(each, _unit(k))}"
+                    for k, each in value.items()
+                )
+                or "none"
             )
         case [] | () | None:
             return "none"

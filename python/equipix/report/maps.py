@@ -12,7 +12,7 @@ from equipix.bolometer.dynamic import DynamicCorrection
 from equipix.calibration.result import Calibration
 from equipix.comparison import Comparison
 from equipix.correction.protocol import Correction
-from equipix.findings import Flag
+from equipix.findings import Flag, usable
 from equipix.fitting.residuals import cell_side
 from equipix.measured.noise import BLOCK
 from equipix.measured.statistics import FrameStatistics
@@ -60,8 +60,14 @@ class Map:
     @cached_property
     def extremes(self) -> tuple[float, float]:
         """Smallest and largest value; NaN where there is none."""
-        known = self.values[np.isfinite(self.values)]
-        return (float(known.min()), float(known.max())) if known.size else (np.nan, np.nan)
+        known = np.isfinite(self.values)
+        if not known.any():
+            return np.nan, np.nan
+        first = self.values.flat[known.argmax()]
+        smallest, largest = (
+            end(self.values, where=known, initial=first) for end in (np.min, np.max)
+        )
+        return float(smallest), float(largest)
 
     def words(self, step: int) -> str:
         """What a picture shows whose points are so many pixels wide, and the extremes."""
@@ -72,13 +78,27 @@ class Map:
         return f"{means}{cells}from {smallest:.4g} to {largest:.4g} {self.unit}".strip()
 
     def reduced(self, largest: int = LARGEST) -> tuple[Floats, int]:
-        """Block means of at most so many rows and columns, and the pixels along a block."""
+        """Means of blocks, at most so many along rows and columns, and the pixels along a block.
+
+        Blocks at the last row and column may be smaller.
+        """
         step = -(-max(self.values.shape) // largest)
+        if step > 1:  # even: means over odd blocks of colour filters would show moiré
+            step += step % 2
         rows = max(step, _AT_ONCE // self.values.shape[1] // step * step)
         parts = [self.values[first : first + rows] for first in range(0, len(self.values), rows)]
-        # A part below one block, of the last rows, is left out like columns at the edge.
-        means = [block_means(part, step) for part in parts if len(part) >= step]
-        return np.concatenate(means), step * self.cell
+        return np.concatenate([_means(part, step) for part in parts]), step * self.cell
+
+
+def _means(values: Array, step: int) -> Floats:
+    """Means over blocks of the values that are known, NaN without any."""
+    known = np.isfinite(values)
+    total, count = np.where(known, values, 0.0), known.astype(np.int32)
+    for axis in (0, 1):
+        first = np.arange(0, values.shape[axis], step)
+        total, count = (np.add.reduceat(each, first, axis) for each in (total, count))
+    means: Floats = np.divide(total, count, where=count > 0, out=np.full(total.shape, np.nan))
+    return means
 
 
 def maps_of(result: Any) -> list[Map]:
@@ -109,7 +129,8 @@ def _of_calibration(calibration: Calibration) -> Iterator[Map]:
         unit = "DN" if calibration.metadata["options"]["weights"] == "equal" else "σ"
         cell = cell_side(calibration.shape, len(calibration.shifts))
         yield Map("Residuals, rms", unit, residuals, "size", cell)
-    yield Map("Beam L", "DN", calibration.beam)
+    over = "" if calibration.cfa is None else ", over the response of each colour"
+    yield Map(f"Beam L{over}", "DN", calibration.beam)
     if calibration.dark is not None:
         yield Map("Dark", "DN", calibration.dark)
 
@@ -140,8 +161,9 @@ def _of_dynamic(correction: DynamicCorrection) -> Iterator[Map]:
     low, high = correction.axes.substrate_c
     middle = (low + high) / 2
     state = correction.correction(middle)
-    yield Map(f"Offset at {middle:.4g} °C", "DN", state.coefficients[0])
-    yield Map(f"Gain at {middle:.4g} °C", "", state.coefficients[1])
+    offset, gain = np.where(usable(state.flags), state.coefficients, np.nan)
+    yield Map(f"Offset at {middle:.4g} °C", "DN", offset)
+    yield Map(f"Gain at {middle:.4g} °C", "", gain)
 
 
 def _of_statistics(frames: FrameStatistics) -> Iterator[Map]:
@@ -160,7 +182,9 @@ def _of_scene(correction: SceneCorrection) -> Iterator[Map]:
 def _of_correction(correction: Correction) -> Iterator[Map]:
     names = ("Offset of the correction", "Gain of the correction")
     for power, plane in enumerate(correction.coefficients):
-        name = names[power] if power < len(names) else f"Coefficient of order {power}"
+        if power == 0 and not np.nan_to_num(plane).any():
+            continue  # of a gain alone
+        name = names[power] if power < len(names) else f"Coefficient of degree {power}"
         yield Map(name, ("DN", "", "1/DN", "1/DN²")[power], plane)
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import base64
 import io
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -17,7 +18,8 @@ from equipix._check import Array, Floats
 from equipix._native import __version__
 from equipix.calibration.result import Calibration
 from equipix.comparison import Comparison
-from equipix.errors import EquipixError
+from equipix.errors import EquipixError, InputError
+from equipix.experiment.image_files import sha256_of
 from equipix.findings import Finding, Flag, usable
 from equipix.io.paths import write_whole
 from equipix.nuc.response import Response
@@ -32,7 +34,14 @@ from equipix.report.drawing import (
     limits_of,
 )
 from equipix.report.figures import COMPARED, pair_in_words, rows_of, summary, words_of
-from equipix.report.limits import Check, Limits, LimitsFile, checked
+from equipix.report.limits import (
+    Check,
+    ComparisonLimits,
+    Limits,
+    LimitsFile,
+    checked,
+    verdict_of,
+)
 from equipix.report.maps import Map, difference_maps, flagged, maps_of
 
 if TYPE_CHECKING:
@@ -46,6 +55,9 @@ _CELL = 160
 
 _MOST_LISTED = 200
 """Most flagged pixels that are listed one by one."""
+
+_MOST_BYTES = 15_000_000
+"""Most bytes of a page."""
 
 _WORDS = 2**16 - 2
 """Steps between the smallest and the largest value of a map; the word 0 stands for no value."""
@@ -65,7 +77,7 @@ class Part(NamedTuple):
 
     name: str
     what: str
-    findings: tuple[Finding, ...]
+    findings: tuple[Finding, ...] | None
     checks: list[Check]
     figures: list[tuple[str, str]]
     maps: list[dict[str, Any]]
@@ -76,9 +88,7 @@ class Part(NamedTuple):
     @property
     def verdict(self) -> str:
         """PASS or FAIL; nothing where nothing is judged."""
-        if not self.checks:
-            return ""
-        return "PASS" if all(check.passed for check in self.checks) else "FAIL"
+        return verdict_of(self.checks)
 
 
 def page(parts: list[Part], title: str) -> str:
@@ -127,10 +137,13 @@ def _rendered(template: str, **content: Any) -> str:
 
 def part_of(name: str, result: Any, limits: LimitsFile, *, share: int = 1) -> Part:
     """Collect what a page says of a result; of `share` results on it maps are smaller."""
-    figures, findings = summary(result), tuple(getattr(result, "findings", ()))
+    figures, findings = summary(result), getattr(result, "findings", None)
     flags = getattr(result, "flags", None)
     if flags is not None:
         figures["flagged_share"] = float(np.mean(~usable(flags)))
+    judged = {"flagged_share": None} | figures
+    if math.isnan(figures.get("reduced_chi2", figures.get("variance_of_a_value", 0.0))):
+        judged["reduced_chi2"] = None  # no more values than unknowns
     maps = maps_of(result)
     curves = curves_of(result, maps[0])
     if flags is not None and flags.any():
@@ -139,7 +152,7 @@ def part_of(name: str, result: Any, limits: LimitsFile, *, share: int = 1) -> Pa
         name=name,
         what=repr(result).strip("<>"),
         findings=findings,
-        checks=checked(_limits_of(result, limits), figures, findings),
+        checks=checked(_limits_of(result, limits), judged, findings),
         figures=words_of(figures),
         maps=[mapped(each, int(LARGEST / share**0.5)) for each in maps],
         plots=[*map(drawn, curves)],
@@ -148,43 +161,72 @@ def part_of(name: str, result: Any, limits: LimitsFile, *, share: int = 1) -> Pa
     )
 
 
+def comparison_checks(
+    comparison: Comparison, number: int, findings: Iterable[Finding], limits: ComparisonLimits
+) -> list[Check]:
+    """Judge a pair, by what noise predicts and by limits."""
+    names = ("rms", "block_rms", "largest")
+    figures = {name: float(getattr(comparison, name)[number]) for name in names}
+    return [
+        *(
+            Check(
+                f"{each.what}, over predicted",
+                f"{each.times:.3g}",
+                f"{each.low:.3g} to {each.high:.3g}",
+                each.passed,
+            )
+            for each in comparison.checks[number]
+        ),
+        *checked(limits, figures, findings),
+    ]
+
+
 def comparison_parts(
-    comparison: Comparison, names: Sequence[str], calibrations: Sequence[Calibration]
+    comparison: Comparison,
+    files: Sequence[Path],
+    calibrations: Sequence[Calibration],
+    limits: ComparisonLimits,
 ) -> list[Part]:
     """Collect what a page says of calibrations that were compared: a part for each pair."""
     parts, largest = [], int(LARGEST / len(comparison.pairs) ** 0.5)
-    scatter = maps_of(comparison)[0]
+    scatter, hashes = maps_of(comparison)[0], sha256_of(files)
     for number, (i, j) in enumerate(comparison.pairs):
         maps = [*difference_maps("Difference", comparison.difference(number)), scatter]
         curves = (draw_histogram, draw_spectrum, draw_profiles)
+        findings = tuple(dict.fromkeys(calibrations[i].findings + calibrations[j].findings))
+        told = [(str(files[k]), repr(calibrations[k]).strip("<>")) for k in (i, j)]
         parts.append(
             Part(
-                name=f"{names[i]} − {names[j]}",
+                name=f"{files[i]} − {files[j]}",
                 what=f"{comparison.verdicts[number]}.".capitalize(),
-                findings=tuple(dict.fromkeys(calibrations[i].findings + calibrations[j].findings)),
-                checks=[
-                    Check(
-                        f"{each.what}, found over predicted",
-                        f"{each.times:.3g}",
-                        f"{each.low:.3g} to {each.high:.3g}",
-                        each.low <= each.times <= each.high,
-                    )
-                    for each in comparison.checks[number]
-                ],
+                findings=findings,
+                checks=comparison_checks(comparison, number, findings, limits),
                 figures=words_of(summary(comparison), without=("verdicts",)),
                 maps=[mapped(each, largest) for each in maps],
                 plots=[drawn(partial(draw, shown=maps[0])) for draw in curves],
                 tables=[Table("Differences", COMPARED, rows_of(comparison, number))],
-                provenance=[(names[k], repr(calibrations[k]).strip("<>")) for k in (i, j)],
+                provenance=told + [(f"sha256 of {files[k]}", hashes[files[k]]) for k in (i, j)],
             )
         )
     return parts
 
 
 def write_page(path: Path, text: str, *, force: bool) -> None:
-    """Write a page to a file; it appears whole or not at all."""
+    """Write a page to a file; it appears whole or not at all.
+
+    Raises
+    ------
+    InputError
+        If it is larger than browsers and mail take well: then it has too many results.
+    """
+    content = text.encode("utf-8", "replace")  # names of files need not be UTF-8
+    if len(content) > _MOST_BYTES:
+        raise InputError(
+            f"'{path}' would have {len(content) / 1e6:.1f} MB, at most {_MOST_BYTES / 1e6:.0f}: "
+            "write fewer results to a page"
+        )
     with write_whole(path, force=force) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_bytes(content)
 
 
 def _limits_of(result: Any, limits: LimitsFile) -> Limits:
@@ -206,6 +248,7 @@ def mapped(shown: Map, largest: int = LARGEST) -> dict[str, Any]:
         "words": shown.words(step),
         "rows": values.shape[0],
         "cols": values.shape[1],
+        "ends": [size * shown.cell for size in shown.values.shape],
         "step": step,
         "low": repr(ends[0]),
         "high": repr(ends[1]),
@@ -284,32 +327,47 @@ def _shifts(calibration: Calibration) -> Table:
 
 
 def _errors(calibration: Calibration) -> Table:
-    """What the error of M is made of, as far as it is known."""
-    rows = [("Solver", f"{calibration.error_estimate:.2g}", "largest, at any scale")]
-    std, tilt = calibration.sensitivity_std, calibration.tilt_std
+    """What the error of M is made of, as far as it is known; error bars contain the drift."""
+    std, tilt, drift = calibration.sensitivity_std, calibration.tilt_std, calibration.drift
+    rows = []
     if std is not None:
-        rows.append(("Noise, of a pixel", f"{np.nanmedian(std):.2g}", "median"))
+        variance = np.square(std, dtype=np.float64)
+        if drift is not None:
+            response = calibration.sensitivity
+            variance -= response**2 * drift.variance_map(response)
+        noise = np.sqrt(np.maximum(np.nanmedian(variance), 0))
+        rows.append(("Noise, of a pixel", f"{noise:.2g}", "median"))
     if tilt is not None:
-        told = ", ".join(f"{each:.2g}" for each in tilt)
-        rows.append(("Noise, of the tilt", told, "edge to edge, along rows and columns"))
-    drift = calibration.drift
+        variance = np.square(tilt) - np.square(0.0 if drift is None else drift.tilt_std)
+        noise = np.sqrt(np.maximum(variance, 0))
+        rows.append(("Noise, of the tilt", _pair(noise), "edge to edge, along rows and columns"))
     if drift is not None:
-        told = ", ".join(f"{each:.2g}" for each in drift.tilt_std)
-        rows.append(("Drift of the lamp", told, f"in the tilt; the drift is {drift.size:.2g}"))
-    if len(rows) == 1:
+        what = f"in the tilt; the drift is {drift.size:.2g}"
+        rows.append(("Drift of the lamp", _pair(drift.tilt_std), what))
+    if not rows:
         rows.append(("Noise", "not computed", "calibrate with --uncertainty"))
-    return Table("Errors of M by cause", ("Cause", "Standard deviation", "Of what"), rows)
+    solver = (
+        f"The estimated error that the solver left, {calibration.error_estimate:.2g}, is no "
+        "standard deviation."
+    )
+    return Table("Errors of M by cause", ("Cause", "Standard deviation", "Of what"), rows, solver)
+
+
+def _pair(values: Floats) -> str:
+    return ", ".join(f"{each:.2g}" for each in values)
 
 
 def _flagged(flags: Array) -> Table:
-    """Flagged pixels, one by one."""
+    """Flagged pixels, one by one: dead and hot ones before those of a mask or of weak light."""
     rows, cols = np.nonzero(flags)
+    first = np.argsort((flags[rows, cols] & (Flag.DEAD | Flag.HOT)) == 0, kind="stable")
+    rows, cols = rows[first], cols[first]
     listed = [
         (f"{row}, {col}", ", ".join(_names(int(flags[row, col]))))
         for row, col in zip(rows[:_MOST_LISTED], cols[:_MOST_LISTED], strict=True)
     ]
     counts = ", ".join(f"{_words(flag)} {len(at)}" for flag, (at, _) in flagged(flags).items())
-    left = f" The first {_MOST_LISTED} are listed." if len(rows) > _MOST_LISTED else ""
+    left = f" {_MOST_LISTED} of {len(rows)} are listed." if len(rows) > _MOST_LISTED else ""
     return Table("Flagged pixels", ("Row, column", "Flags"), listed, f"{counts}.{left}")
 
 
