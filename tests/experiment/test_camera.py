@@ -80,6 +80,8 @@ class TestTruth:
                 np.sqrt(each.snr_max**2 * 1e9 / each.saturation_light), rel=1e-4
             )
             assert each.snr(1e15, prnu=0.01) == pytest.approx(100, rel=1e-4)
+            weak = each.snr(each.threshold_light, dsnu_e=1e4)
+            assert weak == pytest.approx(each.threshold_e / 1e4, rel=1e-4)
 
     def test_dark_noise_below_that_of_quantisation_counts_as_049_dn(self):
         levels = camera_levels(3, read=0.0, current=0.0)
@@ -126,6 +128,39 @@ class TestTruth:
         noise = np.mean([emva.pair_moments(pair)[1] for pair in off])
         assert found.dark_noise_dn == pytest.approx(np.sqrt(noise))
 
+    def of_darks(self, off, times):
+        """Figures of darks by their means and variances, at four levels of light."""
+        return transfer_of(off + self.SIGNAL, off, np.arange(1.0, 5), times)
+
+    SIGNAL = np.outer([100.0, 200, 300, 400], [1, 1])
+
+    def test_three_times_determine_a_dark_current(self):
+        times = np.array([1.0, 2.0, 3.0, 3.0])
+        found = self.of_darks(np.stack([100 + times, 10 + 2 * times], axis=1), times)
+        assert found.dark_current_mean == pytest.approx(1)
+        assert found.dark_current_variance == pytest.approx(2)
+        assert found.dark_noise_dn == pytest.approx(np.sqrt(10))
+
+    def test_a_dark_that_is_quantised_bounds_the_noise(self):
+        times = np.array([1.0, 2.0, 3.0, 4.0])
+        found = self.of_darks(np.stack([100 + times, 0.19 + 0.01 * times], axis=1), times)
+        assert found.dark_noise_dn == pytest.approx(np.sqrt(0.19))
+        assert np.isnan(found.dark_current_variance)
+        found = self.of_darks(np.stack([100 + times, [0.1, 9, 1, 5]], axis=1), times)
+        assert found.dark_noise_dn == pytest.approx(np.sqrt(0.1))
+
+    def test_a_signal_may_fall_by_5_percent(self):
+        off, light = np.tile([100.0, 10.0], (4, 1)), np.array([1.0, 2.0, 3.0, 2.9])
+        for fall, refused in ((0.049, False), (0.051, True)):
+            on = off + np.stack([[60, 120, 180 * (1 - fall), 180], [60, 120, 180, 200]], axis=1)
+            on = np.vstack([on, [400, 500]])
+            given = on, np.vstack([off, off[:1]]), np.append(light, 5.0), None
+            if refused:
+                with pytest.raises(errors.InputError, match="is 2.9 at level 3 and 3 at level 2"):
+                    transfer_of(*given)
+            else:
+                assert transfer_of(*given).saturation_dn == 300
+
     @pytest.mark.parametrize(("column", "limit"), [(0, 0.5 * np.sqrt(10)), (1, 0.5 * 10)])
     def test_a_line_counts_up_to_its_error_at_the_time_0(self, column, limit):
         # The scatter is orthogonal to a line: its error at 0 is t s √(1/4 + 2.5²/5), s² = 4 a²/2.
@@ -134,8 +169,7 @@ class TestTruth:
         for share, known in ((0.99, True), (1.01, False)):
             off = np.stack([100 + times, np.full(4, 10.0)], axis=1)
             off[:, column] += share * highest * scatter
-            on = off + np.outer([100.0, 200, 300, 400], [1, 1])
-            found = transfer_of(on, off, np.arange(1.0, 5), times)
+            found = self.of_darks(off, times)
             slopes = found.dark_current_mean, found.dark_current_variance
             assert np.isfinite(slopes[column]) == known
             assert np.isfinite(slopes[1 - column])
@@ -188,6 +222,16 @@ def test_a_real_camera_has_the_figures_of_plain_numpy(data_dir, run):
     assert found["quantum_efficiency_percent"] == pytest.approx(45.249, abs=5e-4)
     assert found["prnu_percent"] == pytest.approx(0.262, abs=5e-4)
     assert found["linearity_error_percent"] == pytest.approx(0.297, abs=5e-4)
+
+
+def test_all_figures_are_those_of_plain_numpy(tmp_path):
+    path = written_camera(tmp_path, 3, shape=(16, 20), count=18)
+    bright, dark = ([read_frames(tmp_path / f"{kind}{k}.tif") for k in range(18)] for kind in "bd")
+    many, many_dark = (read_frames(tmp_path / f"{kind}.tif") for kind in "bd")
+    _, _, photons, times = camera_levels(3, shape=(1, 1), count=18)
+    wanted = emva.figures(bright, dark, photons, times, many, many_dark)
+    found = {each.key: each.value for each in figures_of(figures(path))}
+    assert found == pytest.approx(wanted, rel=1e-9)
 
 
 def test_files_have_the_figures_of_their_frames(camera):
@@ -287,8 +331,7 @@ class TestFindings:
         path = replaced(small(tmp_path), "exposure_s", lambda time: 0.01 + 1e-4 * time)
         said = self.kinds(path)
         assert [*said] == ["spread"]
-        assert "from 0.01 to 0.01 s" not in said["spread"]
-        assert "do not determine dark current by the mean, dark current by the" in said["spread"]
+        assert "times of 0.01 s and up to 2.75e-06 s more do not determine dark" in said["spread"]
 
     def test_times_that_contradict_the_noise(self, tmp_path, run):
         path = small(tmp_path, current=2e5, read=2.0)

@@ -332,6 +332,12 @@ class TestEmvaSpatial:
         assert filtered[30, 30] == pytest.approx(1 - 1 / 121)
         assert np.sum(filtered**2) == pytest.approx(1 - 0.0115, abs=5e-5)
 
+    def test_the_high_pass_is_the_same_in_bands_of_any_size(self):
+        image = np.random.default_rng(1).random((40, 9000))
+        whole = high_passed(image)  # bands of 36 of 40 rows, and of 6553 of 9000
+        np.testing.assert_allclose(whole, high_passed(image.T).T, atol=1e-13)
+        assert high_passed(image.astype(np.float32)).dtype == np.float32
+
     def test_averages_give_the_same_as_frames(self):
         rng = np.random.default_rng(10)
         dark = rng.integers(40, 60, (8, *SHAPE), dtype=np.uint16)

@@ -423,7 +423,7 @@ def _on_spread(found: CameraFigures) -> str | None:
     if len(times) < 3 or not unknown:
         return None
     return (
-        f"exposure times from {times[0]:.6g} to {times[-1]:.6g} s do not determine "
+        f"exposure times of {times[0]:.6g} s and up to {np.ptp(times):.3g} s more do not determine "
         f"{', '.join(unknown)}: the error at the time 0 is above half of the noise of a dark. "
         "Spread the exposure times; without that, dark noise is that of the darks as they are"
     )
