@@ -288,7 +288,8 @@ class TestCamera:
             assert f", plane {plane}</h2>" in text
         assert re.search(r"figure +unit +R +G1 +G2 +B", printed)
         found = json.loads(run("emva", path, "--json")[1])
-        assert [*found] == ["output", "R", "G1", "G2", "B"]
+        assert [*found] == ["output", "R", "G1", "G2", "B", "findings"]
+        assert (found["output"], found["findings"]) == (None, [])
         assert found["R"]["gain_dn_per_e"] == pytest.approx(0.25, rel=0.2)
         assert found["B"]["findings"] == []
 
