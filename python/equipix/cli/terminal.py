@@ -82,7 +82,7 @@ def show_result(result: dict[str, Any], found: Findings | None = None, *, as_jso
     """
     result = result if found is None else result | told(found, as_json=as_json)
     if as_json:
-        result = told(()) | result
+        result = result if "findings" in result else result | told(())
         # JSON has no NaN and no infinity: null is what is not determined.
         print(json.dumps(json.loads(json.dumps(result), parse_constant=lambda _: None)))  # noqa: T201
         return
