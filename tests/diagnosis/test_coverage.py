@@ -91,7 +91,9 @@ def test_positions_between_pixels_are_a_cause_before_the_light(shifts, cause, co
     assert json.loads(capsys.readouterr().out)["components"] == components
     terminal.show_result(told, as_json=False)
     out = capsys.readouterr().out
-    assert re.search(rf"^components +{components or 'not determined'}$", out, re.MULTILINE)
+    assert re.search(
+        rf"^separate parts of the sensor +{components or 'not determined'}$", out, re.MULTILINE
+    )
 
 
 def test_positions_that_scatter_about_a_line_lie_on_it():

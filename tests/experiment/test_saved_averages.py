@@ -113,7 +113,7 @@ def test_a_dark_is_no_average_from_which_one_was_subtracted(manifest, direct, tm
     for command in (("average", frames), ("correct", cal, frames)):
         assert run(*command, "--dark", wrong, "-o", tmp_path / "out.tif") == 1
         words = SUBTRACTED.replace("'dark'", "--dark")
-        assert f"error: {wrong}: {words}" in capsys.readouterr().err
+        assert f"{wrong}: {words}" in capsys.readouterr().err
     assert run("calibrate", toml, "-o", tmp_path / "out.tif") == 1
     assert f"[dark] {wrong}: {SUBTRACTED}" in capsys.readouterr().err
     assert not (tmp_path / "out.tif").exists()

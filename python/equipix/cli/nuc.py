@@ -143,11 +143,10 @@ def _quality(
         return ({"": corrected} if colours is None else metrics.planes(corrected, colours)).items()
 
     # Of long series one stack of corrected frames at a time is held.
-    usable: dict[str, Correctability] = {}
-    means: dict[str, Array] = {}
-    for name, plane in planes("nan"):
-        usable[name] = metrics.correctability(plane, confidence=confidence)
-        means[name] = plane.mean(axis=0)
+    usable = {
+        name: (metrics.correctability(plane, confidence=confidence), plane.mean(axis=0))
+        for name, plane in planes("nan")
+    }
     kept = {k: metrics.correctability(v).ratio for k, v in planes("keep")}
     parts = {
         k: {
@@ -163,15 +162,15 @@ def _quality(
             "C": good.ratio,
             "C_from": good.low,
             "C_to": good.high,
-            **_judged(correction, good, means[name]),
+            **_judged(correction, good, mean),
             "C_with_flagged_pixels": kept[name],
             "spatial_variance": good.spatial_variance,
             "temporal_variance": good.temporal_variance,
             **parts[name],
         }
-        for name, good in usable.items()
+        for name, (good, mean) in usable.items()
     }
-    said = tuple(each for good in usable.values() for each in good.findings)
+    said = tuple(each for good, _ in usable.values() for each in good.findings)
     return result[""] if colours is None else result, said
 
 

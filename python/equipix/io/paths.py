@@ -120,8 +120,6 @@ def reading(path: Path) -> Iterator[None]:
             raise FileError(f"{path}: does not exist") from error
         # Values out of range are a fault of the file; no memory, or no library, is not.
         is_fault = not isinstance(error, EquipixError) or isinstance(error, InputError)
-        if isinstance(error, FileNotFoundError) or not (is_fault or path.exists()):
-            raise FileError(f"{path}: does not exist") from error
         if not is_fault:
             raise
         broken = f"incomplete, damaged, or no {path.suffix} file: use a copy, or make it again"
