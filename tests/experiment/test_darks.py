@@ -413,3 +413,16 @@ def test_exif_and_tags_give_the_exposure_time(tmp_path):
     )
     np.save(tmp_path / "d.npy", frame)
     assert settings(tmp_path / "d.npy") == Settings()
+
+
+def test_a_stack_of_another_program_is_no_saved_average(tmp_path):
+    """It may hold JSON of its own, as tifffile writes the shape."""
+    stack = np.ones((3, 16, 20), np.float32)
+    tifffile.imwrite(tmp_path / "stack.tif", stack, photometric="minisblack")
+    assert settings_of(tmp_path / "stack.tif") == Settings()
+
+
+@pytest.mark.filterwarnings("ignore::equipix.errors.InputWarning")
+def test_exposure_times_need_no_dark(tmp_path, camera):
+    path = fits_levels(tmp_path, camera, stated="exposure_s = 2.0\n", dark_times=())
+    assert LevelExperiment.load(path).run(order=0).dark is None

@@ -114,7 +114,8 @@ def chosen(path: Path, manifest: Manifest | LevelManifest) -> Choice:
         pairs = zip(places, measurements, strict=True)
         wanted = [(place, known(place, taken)) for place, (_, taken) in pairs]
         findings: tuple[Finding, ...] = ()
-        if len(entries) < 2 and not any(value is not None for each in stated for value in each):
+        nothing = not any(value is not None for each in stated for value in each)
+        if not entries or (len(entries) < 2 and nothing):
             shares = [(1.0,) * len(entries)] * len(wanted)
             if darks:
                 findings = other_settings(f"{path}: [dark]", darks[0], wanted, tolerance, _WORDS)

@@ -45,8 +45,8 @@ _PLAIN = Wording("", ("", ""), "", "", "", "", "", "")
 
 def settings_of(file: Path) -> Settings:
     """Exposure time and temperature of frames by their headers, of a saved average by its own."""
-    if content := saved_content(file):
-        return settings_in(content["fields"].get("metadata", {}))
+    if fields := saved_content(file).get("fields"):  # other programs write JSON of their own
+        return settings_in(fields.get("metadata", {}))
     return settings(file)
 
 
