@@ -716,5 +716,5 @@ class TestMisfit:
             stated = NoiseModel(NOISE.read_noise * share, NOISE.gain * share**2)
             found = nuc.fit(levels, variance=stated)
             said += any("do not follow" in each.message for each in found.findings)
-        figure("linear sensors whose next order is named", "at most 1 %", said / len(seeds))
+        figure("linear sensors whose next order is named", said / len(seeds), "at most 1 %")
         assert said <= 0.01 * len(seeds)
