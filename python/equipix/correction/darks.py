@@ -208,7 +208,7 @@ def _warn_of_settings(
     if dark == Settings():
         return ()
     wanted = [(str(file), settings(file)) for file in files]
-    return say(*other_settings(named, dark, wanted, tolerance, _WORDS))
+    return say(*other_settings(named, dark, wanted, tolerance, _WORDS.several))
 
 
 def warn_of_darker(frame: Array, dark: Array) -> Findings:

@@ -118,7 +118,9 @@ def chosen(path: Path, manifest: Manifest | LevelManifest) -> Choice:
         if not entries or (len(entries) < 2 and nothing):
             shares = [(1.0,) * len(entries)] * len(wanted)
             if darks:
-                findings = other_settings(f"{path}: [dark]", darks[0], wanted, tolerance, _WORDS)
+                findings = other_settings(
+                    f"{path}: [dark]", darks[0], wanted, tolerance, _WORDS.several
+                )
         else:
             check_darks(names, darks, stated, _WORDS)
             shares = [shares_of(*each, darks, tolerance, _WORDS) for each in wanted]

@@ -26,7 +26,6 @@ from equipix._check import (
 from equipix.errors import FileError, InputError
 from equipix.io.formats import ONLY_RESULTS
 from equipix.io.frames import (
-    apart,
     check_image,
     frame_format,
     is_image,
@@ -36,7 +35,7 @@ from equipix.io.frames import (
 )
 from equipix.io.paths import find_files
 from equipix.io.record import made, now, read_record
-from equipix.measured.darks import taken_with
+from equipix.measured.darks import furthest, taken_with
 from equipix.measured.saturation import level_of
 from equipix.measured.statistics import FrameStatistics, _masked, _step, _subtract, saved_shape
 from equipix.measured.stream import Rejection, batches, sum_dtype, unmasked
@@ -135,18 +134,19 @@ def average(
         progress,
     )
     taken = _paths_or_frames(frames)
-    settings: dict[str, float] = {}
+    common: dict[str, float] = {}
     with naming_memory("averaging"):
         if isinstance(taken, list):
-            statistics = _average_files(taken, how)
-            settings = taken_with(find_files(taken))
+            paths = find_files(taken)
+            statistics = _average_files(paths, how)
+            common = taken_with(paths)
         else:
             statistics = _average_batches(batches(taken), how, operator.length_hint(frames))
         if not statistics.count.any():
             raise InputError("'frames' holds no finite number: give frames with numbers")
         options = {"saturation": how.level, "reject": statistics.reject}
         # A saved average brings its own.
-        metadata = statistics.metadata or made(options=options, started=started, **settings)
+        metadata = statistics.metadata or made(options=options, started=started, **common)
         found = dataclasses.replace(_subtract(statistics, offset), metadata=metadata)
         shape, level, less = found.mean.shape, found.saturation, "no" if dark is None else "its"
         text = "averaged %d frames of %d × %d pixels, saturation level %s, %s dark subtracted"
@@ -182,8 +182,7 @@ def _paths_or_frames(source: Any) -> list[Any] | Array | Iterator[Any]:
     raise InputError("'frames' holds no frames")
 
 
-def _average_files(names: list[Any], how: _How) -> FrameStatistics:
-    paths = find_files(names)
+def _average_files(paths: list[Path], how: _How) -> FrameStatistics:
     LOG.info("files to average: %d, the first %s", len(paths), paths[0])
     LOG.debug("reads %s", ", ".join(map(str, paths)))
     _refuse_mixed(paths)
@@ -208,11 +207,11 @@ def _refuse_mixed(paths: list[Path]) -> None:
     """Refuse files of different exposure times, where they hold them."""
     if len(paths) < 2:
         return
-    times = {path: time for path in paths if (time := settings(path).exposure_s) is not None}
-    least, most = (choose(times, key=times.__getitem__, default=None) for choose in (min, max))
-    if least and most and apart(0, times[least], times[most], 0.0):
+    held = {path: settings(path) for path in paths}
+    if ends := furthest(held, 0, 0.0):
+        (least, low), (most, high) = ((path, held[path].exposure_s) for path in ends)
         raise FileError(
-            f"'{least}' holds the exposure time {times[least]:g} s, '{most}' {times[most]:g} s, "
+            f"'{least}' holds the exposure time {low:g} s, '{most}' {high:g} s, "
             "expected one: average the frames of each exposure time by themselves"
         )
 

@@ -1,6 +1,6 @@
 """Exposure time and temperature of files, and the dark frames that fit them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,9 +38,6 @@ class Wording(NamedTuple):
     alike: str
     temperature: str
     several: str
-
-
-_PLAIN = Wording("", ("", ""), "", "", "", "", "", "")
 
 
 def settings_of(file: Path) -> Settings:
@@ -88,12 +85,14 @@ def common_settings(
     place: str, stated: Settings, files: Sequence[Path], tolerance: float, words: Wording
 ) -> Settings:
     """Exposure time and temperature of some files: as stated, else the mean of what they hold."""
-    read, found = {file: settings_of(file) for file in files}, list(stated)
+    read = {file: settings_of(file) for file in files}
+    found = [
+        mean if value is None else value
+        for value, mean in zip(stated, _mean(read.values()), strict=True)
+    ]
     for index, (name, (_, unit, what)) in enumerate(zip(words.values, KEYS, strict=True)):
         known = {file: value for file, each in read.items() if (value := each[index]) is not None}
-        wanted = stated[index]
-        if known and wanted is None:
-            found[index] = wanted = float(np.mean([*known.values()]))
+        wanted = found[index]
         different = [file for file in known if apart(index, wanted, known[file], tolerance)]
         if different and stated[index] is not None:
             remedy = words.contradiction.format(name=name, place=place)
@@ -111,14 +110,34 @@ def common_settings(
     return Settings(*found)
 
 
+def _mean(held: Iterable[Settings]) -> Settings:
+    """Mean of what is known of some settings."""
+    known = ([each for each in values if each is not None] for values in zip(*held, strict=True))
+    return Settings(*(float(np.mean(values)) if values else None for values in known))
+
+
+def furthest(
+    held: Mapping[Path, Settings], index: int, tolerance: float
+) -> tuple[Path, Path] | None:
+    """Files of the lowest and of the highest value of a setting; None where these are the same."""
+    known = {file: value for file, each in held.items() if (value := each[index]) is not None}
+    if not known:
+        return None
+    least, most = min(known, key=known.__getitem__), max(known, key=known.__getitem__)
+    return (least, most) if apart(index, known[least], known[most], tolerance) else None
+
+
 def other_settings(
     dark: str,
     held: Settings,
     frames: Sequence[tuple[str, Settings]],
     tolerance: float,
-    words: Wording,
+    several: str = "",
 ) -> tuple[Finding, ...]:
-    """Findings on a dark of another exposure time or temperature than frames by their headers."""
+    """Findings on a dark of another exposure time or temperature than frames by their headers.
+
+    `several` continues the remedy where more than one dark may be given.
+    """
     found = []
     for index, (_, unit, what) in enumerate(KEYS):
         differ = [
@@ -134,7 +153,7 @@ def other_settings(
         message = (
             f"{dark} was taken with the {what} {held[index]:g} {unit}, {place} with {value:g} "
             f"{unit} by its files{likewise}{limit}, and dark current differs between them: give "
-            f"dark frames of {value:g} {unit}{words.several.format(what=what)}"
+            f"dark frames of {value:g} {unit}{several.format(what=what)}"
         )
         found.append(Finding("other_dark", message, "input"))
     return tuple(found)
@@ -145,20 +164,17 @@ def average_findings(frames: Sequence[Path], dark: Sequence[Path]) -> tuple[Find
     held = {file: settings(file) for file in frames}
     named = [(f"'{file.name}'", each) for file, each in held.items()]
     found: tuple[Finding, ...] = ()
-    known = {
-        file: each.temperature_c for file, each in held.items() if each.temperature_c is not None
-    }
-    least, most = (choose(known, key=known.__getitem__, default=None) for choose in (min, max))
-    if least and most and apart(1, known[least], known[most], TOLERANCE_K):
+    if ends := furthest(held, 1, TOLERANCE_K):
+        least, most = ends
         message = (
-            f"'{least.name}' was taken at {known[least]:g} °C, '{most.name}' at {known[most]:g} °C "
-            f"(limit {TOLERANCE_K:g} K), and dark current differs between them: average the frames "
-            "of each temperature by themselves"
+            f"'{least.name}' was taken at {held[least].temperature_c:g} °C, '{most.name}' at "
+            f"{held[most].temperature_c:g} °C (limit {TOLERANCE_K:g} K), and dark current differs "
+            "between them: average the frames of each temperature by themselves"
         )
         found = (Finding("temperature", message, "input"),)
     if dark:
-        of_dark = common_settings("'dark'", Settings(), dark, float("inf"), _PLAIN)
-        found += other_settings("'dark'", of_dark, named, TOLERANCE_K, _PLAIN)
+        of_dark = _mean(map(settings_of, dark))
+        found += other_settings("'dark'", of_dark, named, TOLERANCE_K)
     return found
 
 
@@ -169,9 +185,9 @@ def taken_with(files: Sequence[Path]) -> dict[str, float]:
     """
     if any(map(is_image, files)):
         return {}
-    try:
-        found = common_settings("", Settings(), files, TOLERANCE_K, _PLAIN)
-    except FileError:  # frames of several temperatures
+    held = list(map(settings_of, files))
+    found = _mean(held)
+    if any(apart(k, found[k], each[k], TOLERANCE_K) for each in held for k in range(len(KEYS))):
         return {}
     pairs = zip(KEYS, found, strict=True)
     return {key: value for (key, *_), value in pairs if value is not None}
