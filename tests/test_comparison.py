@@ -16,6 +16,7 @@ import equipix
 from equipix import cli, errors, simulate
 from equipix.comparison import Check, _student_quantile, _verdict
 from equipix.pictures import draw_comparison
+from equipix.report.figures import rows_of
 
 SHAPE = (96, 128)
 ARMS = ((5, 7), (7, 11), (11, 19))
@@ -52,7 +53,8 @@ def test_they_agree_as_their_uncertainties_predict(experiments):
         margin = 4 * np.hypot(scatter[i], scatter[j]) * np.sqrt(1 + 1 / 12)
         got = np.array([result.rms[k], result.block_rms[k]]) ** 2
         wanted = np.array([result.predicted_rms[k], result.predicted_block_rms[k]]) ** 2
-        np.testing.assert_allclose(wanted, mean[i] + mean[j], rtol=1e-12)
+        solver = sum(calibrations[each].error_estimate ** 2 for each in (i, j))
+        np.testing.assert_allclose(wanted, mean[i] + mean[j] + solver, rtol=1e-12)
         # Twice the margin: the difference of two has their covariance's scatter besides.
         assert (np.abs(got - wanted) < 2 * margin).all()
 
@@ -321,7 +323,7 @@ def alike():
 
 
 def test_errors_of_the_solver_are_no_difference(alike):
-    """Of each the estimate counts once: at the upper limits, in pixels, tilts and blocks."""
+    """Of each the estimate counts once in what is predicted, in pixels, tilts and blocks."""
     first, second = alike
     plain = equipix.compare(alike).checks[0]
     coarse = dataclasses.replace(first, error_estimate=3e-3)
@@ -408,12 +410,60 @@ def test_a_pixel_far_out_is_no_tilt(alike):
         assert now.found == pytest.approx(was.found, abs=4 * 8e-4 * 6 / 3072)
 
 
-def test_maps_without_standard_deviations_are_not_judged(alike):
+NOT_JUDGED = (
+    ({"sensitivity_std": None}, "the first has no standard deviations (calibrate with"),
+    ({"sensitivity_std": np.zeros(SMALL)}, "all standard deviations of the first are 0"),
+    ({"error_estimate": np.inf}, "the solver of the first failed"),
+    ({"error_estimate": np.nan}, "the solver of the first failed"),
+)
+TOLD = [(5.5e-4, 5.3e-5)] * 3
+
+
+@pytest.mark.parametrize(("change", "words"), NOT_JUDGED)
+def test_a_pair_that_is_not_judged_says_why(alike, change, words):
+    """The pair of the two others is judged."""
     first, second = alike
-    for change in ({"sensitivity_std": 0 * first.sensitivity_std}, {"error_estimate": np.inf}):
-        result = equipix.compare([dataclasses.replace(first, **change), second])
-        assert result.checks == ((),)
-        assert result.verdicts[0].startswith("not judged")
+    wrong = dataclasses.replace(first, **change)
+    result = equipix.compare([wrong, first, second])
+    assert result.checks[:2] == ((), ())
+    assert all(verdict.startswith(f"not judged: {words}") for verdict in result.verdicts[:2])
+    assert np.isfinite(result.predicted_rms).tolist() == [False, False, True]
+    assert result.verdicts[2] == equipix.compare(alike).verdicts[0]
+    swapped = equipix.compare([first, wrong])
+    assert swapped.verdicts[0].startswith(f"not judged: {words.replace('first', 'second')}")
+    assert (swapped.predicted_rms, swapped.predicted_block_rms) == (None, None)
+
+
+def test_what_is_told_judges_no_pair_whose_solver_failed(alike):
+    first, second = alike
+    for change, words in NOT_JUDGED:
+        result = equipix.compare(
+            [dataclasses.replace(first, **change), first, second], predicted=TOLD
+        )
+        failed = "solver" in words
+        assert [bool(checks) for checks in result.checks] == [not failed, not failed, True]
+        assert np.isnan(result.predicted_rms).tolist() == [failed, failed, False]
+        assert result.verdicts[0].startswith("not judged: the solver of the first") is failed
+
+
+def test_predictions_are_those_of_the_verdict(alike, tmp_path, run):
+    """With the errors of both solvers, in quadrature."""
+    coarse = dataclasses.replace(alike[0], error_estimate=3e-3)
+    result = equipix.compare([coarse, alike[1]], predicted=TOLD[:2])
+    pixels, *_, blocks = result.checks[0]
+    solver = 3e-3**2 + alike[1].error_estimate ** 2
+    for check, rms, told in (
+        (pixels, result.predicted_rms, TOLD[0][0]),
+        (blocks, result.predicted_block_rms, TOLD[0][1]),
+    ):
+        assert check.predicted == pytest.approx(np.sqrt(2 * told**2 + solver), rel=1e-12)
+        assert rms[0] == pytest.approx(check.predicted, rel=1e-12)
+    rows = {each[0]: each for each in rows_of(equipix.compare([coarse, alike[1]]), 0)}
+    assert float(rows["pixels, rms"][2]) > 3e-3
+    for number, each in enumerate((coarse, alike[1])):
+        each.save(tmp_path / f"{number}.npz")
+    printed = run("compare", *(tmp_path / f"{k}.npz" for k in range(2)), "--json")[1]
+    assert json.loads(printed)["pairs"][0]["predicted_rms"] > 3e-3
 
 
 @pytest.mark.parametrize(
@@ -436,7 +486,7 @@ def check_pairs(files, limits, run):
     status, _, told = run("compare", files[0], files[3], "--check")
     assert status == 1
     assert "nothing is judged of" in told
-    assert "--uncertainty" in told
+    assert ": the second has no standard deviations (calibrate with --uncertainty), or give" in told
     limits.write_text("[comparison]\nrms = 1e-6\nlargest = 1\n")
     asked = ("compare", *files[:2], "--limits", limits, "--check")
     status, printed, told = run(*asked)
@@ -473,7 +523,7 @@ def test_a_page_and_words_have_the_verdict(tmp_path, run):
     ):
         assert words in text
     found = json.loads(run("compare", files[0], files[3], "--json")[1])
-    assert found["pairs"][0]["verdict"].startswith("not judged: no standard deviations")
+    assert found["pairs"][0]["verdict"].startswith("not judged: the second has no standard")
     assert found["pairs"][0]["checks"] == []
     assert run("compare", *files[:2], "-o", tmp_path / "page.htm")[0] == 1
     # The page has the content of its files, and what failed.

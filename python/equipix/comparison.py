@@ -72,10 +72,15 @@ class Comparison(Brief, Shown):
         Whether free fluxes leave the tilt of one of the two undetermined: then the slope of ln of
         their ratio is no difference, and is left out of all figures.
     predicted_rms, predicted_block_rms : ndarray, shape (pairs,), float64, or None
-        What the uncertainties of two independent calibrations predict for `rms` and `block_rms`.
+        What the uncertainties of two independent calibrations predict for `rms` and `block_rms`,
+        with the estimated errors of their solvers; NaN where it is not known, None where it is of
+        no pair.
     checks : tuple of tuple of Check
         Of each pair what is judged: ``what``, ``found``, ``predicted``, and between which ratios
         ``low`` and ``high`` of both noise leaves it. Empty where nothing is predicted.
+    verdicts : tuple of str
+        Of each pair whether it agrees within the noise of both, by the rule of `compare`, or why it
+        is not judged.
     """
 
     sensitivities: Array
@@ -88,11 +93,7 @@ class Comparison(Brief, Shown):
     predicted_rms: Array | None = None
     predicted_block_rms: Array | None = None
     checks: tuple[tuple[Check, ...], ...] = ()
-
-    @property
-    def verdicts(self) -> tuple[str, ...]:
-        """Of each pair whether it agrees within the noise of both, by the rule of `compare`."""
-        return tuple(map(_verdict, self.checks))
+    verdicts: tuple[str, ...] = ()
 
     def difference(self, pair: int) -> Array:
         """Relative difference of the sensitivities of a pair, (M₁ − M₂)/M₂, shape (rows, cols).
@@ -115,9 +116,9 @@ def compare(
     predicted : array_like, shape (n, 2), optional
         Of each calibration the root mean square of its relative error that is expected in single
         pixels and in means over blocks of 16×16, as `equipix.simulate.noise_prediction` gives.
-        Unless given it is computed from `sensitivity_std` where all have one; that of the blocks
-        by `Calibration.std_of` of 16 of them, where none was read from a file. Where one has
-        none above 0, or its solver failed, nothing is judged.
+        Unless given it is computed from `sensitivity_std`; that of the blocks by
+        `Calibration.std_of` of 16 of them, where neither was read from a file. A pair of which one
+        has none above 0, or a solver that failed, is not judged.
 
     Returns
     -------
@@ -140,7 +141,8 @@ def compare(
 
     `Comparison.verdicts` judges each pair. Found over predicted must lie between limits that noise
     alone crosses in at most 1 % of the pairs; each check has an even share of it. The estimated
-    errors of both solvers are part of what is predicted, in quadrature, and of the upper limits.
+    errors of both solvers are part of what is predicted, in quadrature. Solvers may have left less:
+    lower limits are those without these errors.
 
     - The rms over pixels, without the tilt. Its square over the predicted one follows Fisher's
       distribution. Errors of waves of M have variances 1/λ(q) (`equipix.plan.error_budget`), so
@@ -193,7 +195,23 @@ def compare(
     compared = sensitivities
     if is_open.any():
         compared = np.stack([_levelled(each, sensitivities[0]) for each in sensitivities])
-    expected = _expected(calibrations) if predicted is None else _told(predicted, count)
+    given = None if predicted is None else _told(predicted, count)
+    reasons = [_not_judged(each, told=given is not None) for each in calibrations]
+    expected = np.full((count, 2), np.nan)
+    for k in (k for k, reason in enumerate(reasons) if not reason):
+        expected[k] = _expected(calibrations[k]) if given is None else given[k]
+    checks = tuple(
+        ()
+        if any(reasons[k] for k in pair)
+        else _checks(
+            [calibrations[k] for k in pair],
+            sensitivities[pair],
+            differences[number],
+            np.square(expected[pair]),
+            told=given is not None,
+        )
+        for number, pair in enumerate(pairs)
+    )
     return Comparison(
         sensitivities=sensitivities,
         agreement=compared.std(axis=0, ddof=1),
@@ -202,26 +220,20 @@ def compare(
         rms=np.array([rms(each) for each in differences]),
         block_rms=np.array([rms(block_means(each)) for each in differences]),
         largest=np.array([np.nanmax(np.abs(each)) for each in differences]),
-        checks=tuple(
-            ()
-            if expected is None
-            else _checks(
-                [calibrations[k] for k in pair],
-                sensitivities[pair],
-                differences[number],
-                np.square(expected[pair]),
-                told=predicted is not None,
-            )
-            for number, pair in enumerate(pairs)
+        checks=checks,
+        verdicts=tuple(
+            _verdict(each, [reasons[k] for k in pair])
+            for each, pair in zip(checks, pairs, strict=True)
         ),
-        **_predictions(expected, pairs),
+        **_predictions(calibrations, expected, pairs),
     )
 
 
-def _verdict(checks: tuple[Check, ...]) -> str:
-    """Words on the checks of a pair."""
+def _verdict(checks: tuple[Check, ...], reasons: Sequence[str] = ()) -> str:
+    """Words on the checks of a pair, or on the reasons why there are none, of either."""
     if not checks:
-        return "not judged: no standard deviations (calibrate with --uncertainty)"
+        both = zip(reasons, ("the first", "the second"), strict=True)
+        return f"not judged: {', '.join(reason.format(which) for reason, which in both if reason)}"
     for words, failed in (
         ("differ by more than their noise", [c for c in checks if c.times > c.high]),
         ("agree better than their noise", [c for c in checks if not c.passed]),
@@ -378,22 +390,30 @@ def _in_one_gauge(calibrations: Sequence[Calibration]) -> Array:
     return np.asarray(maps / np.nanmean(maps, axis=(1, 2), keepdims=True))
 
 
-def _expected(calibrations: Sequence[Calibration]) -> Array | None:
-    """Rms of the relative error in pixels and in block means, by the uncertainties, if known."""
-    expected = []
-    for each in calibrations:
-        if each.sensitivity_std is None:
-            return None
-        with np.errstate(divide="ignore", invalid="ignore"):
-            relative = each.sensitivity_std / each.sensitivity
-        pixels = rms(relative[np.isfinite(relative) & usable(each.flags)])
-        blocks = (
-            np.nan if each.weighted is None else rms(np.asarray(each.std_of(_some_blocks(each))))
-        )
-        if not (pixels > 0 and np.isfinite(each.error_estimate)):
-            return None
-        expected.append((pixels, blocks))
-    return np.array(expected)
+def _not_judged(calibration: Calibration, *, told: bool) -> str:
+    """Why nothing can be predicted with a calibration, or what is `told` not used; empty if not."""
+    if not np.isfinite(calibration.error_estimate):
+        return "the solver of {} failed"
+    if told:
+        return ""
+    if calibration.sensitivity_std is None:
+        return "{} has no standard deviations (calibrate with --uncertainty)"
+    return "" if _of_pixels(calibration) > 0 else "all standard deviations of {} are 0"
+
+
+def _of_pixels(calibration: Calibration) -> float:
+    """Rms over usable pixels of the relative standard deviations that are known."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        relative = np.asarray(calibration.sensitivity_std) / calibration.sensitivity
+    return rms(relative[np.isfinite(relative) & usable(calibration.flags)])
+
+
+def _expected(calibration: Calibration) -> tuple[float, float]:
+    """Rms of the relative error in pixels and in block means; of these NaN if read from a file."""
+    if calibration.weighted is None:
+        return _of_pixels(calibration), np.nan
+    blocks = rms(np.asarray(calibration.std_of(_some_blocks(calibration))))
+    return _of_pixels(calibration), blocks
 
 
 def _some_blocks(calibration: Calibration) -> Array:
@@ -422,9 +442,12 @@ def _told(predicted: ArrayLike, count: int) -> Array:
     return errors
 
 
-def _predictions(expected: Array | None, pairs: Ints) -> dict[str, Array]:
-    """Errors of two calibrations in quadrature, in pixels and in blocks."""
-    if expected is None:
-        return {}
-    rms, block_rms = np.sqrt((expected[pairs] ** 2).sum(axis=1)).T
-    return {"predicted_rms": rms, "predicted_block_rms": block_rms}
+def _predictions(
+    calibrations: Sequence[Calibration], expected: Array, pairs: Ints
+) -> dict[str, Array]:
+    """Errors of two calibrations and of their solvers in quadrature, in pixels and in blocks."""
+    solver = np.array([each.error_estimate for each in calibrations])
+    variances = expected**2 + solver[:, None] ** 2
+    rms, block_rms = np.sqrt(variances[pairs].sum(axis=1)).T
+    known = np.isfinite(rms).any()
+    return {"predicted_rms": rms, "predicted_block_rms": block_rms} if known else {}

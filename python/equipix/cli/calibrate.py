@@ -163,7 +163,10 @@ def compare(
     if limits is not None and not as_json:
         terminal.show_limits(judged)
     if check:
-        refuse_beyond(judged, "calibrate with --uncertainty, or give --limits")
+        why = {
+            each.removeprefix("not judged: ") for each in result.verdicts if "not judged" in each
+        }
+        refuse_beyond(judged, f"{'; '.join(sorted(why))}, or give --limits")
 
 
 def _show_pairs(pairs: list[dict[str, Any]], result: Comparison, words: dict[str, Any]) -> None:
