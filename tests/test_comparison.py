@@ -14,7 +14,8 @@ import pytest
 
 import equipix
 from equipix import cli, errors, simulate
-from equipix.comparison import Check, _student_quantile, _verdict
+from equipix.comparison import Check, _verdict
+from equipix.metrics.correctability import student_quantile
 from equipix.pictures import draw_comparison
 from equipix.report.figures import rows_of
 
@@ -362,7 +363,7 @@ def test_a_drift_in_error_bars_widens_the_tilt_alone(alike):
     pixels, *tilts = equipix.compare(pair).checks[0]
     assert [each.what for each in tilts] == ["tilt along rows", "tilt along columns"]
     for axis, each in enumerate(tilts):
-        assert each.high == pytest.approx(_student_quantile(1 - 0.01 / 3 / 2, 2), rel=1e-9)
+        assert each.high == pytest.approx(student_quantile(1 - 0.01 / 3 / 2, 2), rel=1e-9)
         std = np.sqrt(sum(c.tilt_std[axis] ** 2 + c.error_estimate**2 for c in pair))
         assert each.predicted == pytest.approx(std, rel=1e-9)
     # The pixels' part is without it, to the rounding of float32 error bars.
@@ -471,7 +472,7 @@ def test_predictions_are_those_of_the_verdict(alike, tmp_path, run):
 )
 def test_quantiles_are_those_of_tables(freedom, quantile):
     """Of Student's t at 0.995; of the normal distribution for a freedom of 0."""
-    assert _student_quantile(0.995, freedom) == pytest.approx(quantile, rel=2e-5)
+    assert student_quantile(0.995, freedom) == pytest.approx(quantile, rel=2e-5)
 
 
 def check_pairs(files, limits, run):

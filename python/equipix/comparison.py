@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +12,7 @@ from equipix.calibration.result import Calibration
 from equipix.errors import InputError
 from equipix.findings import determined, usable
 from equipix.measured.noise import BLOCK
-from equipix.metrics.correctability import fisher_quantile
+from equipix.metrics.correctability import fisher_quantile, student_quantile
 from equipix.metrics.maps import block_means, relative_error, rms, slope_pixels, tilt
 from equipix.shown import Brief, Shown
 
@@ -271,7 +270,7 @@ def _checks(
     )
     what = "pixels, rms" if told else "pixels without tilt, rms"
     limits = [(what, rms(pixels), float(predicted.sum()), low, high)]
-    high = _student_quantile(1 - tail / 2, min(drifts, default=0))
+    high = student_quantile(1 - tail / 2, min(drifts, default=0))
     for axis in judged:
         name = f"tilt along {('rows', 'columns')[axis]}"
         limits.append((name, float(slopes[axis]), float(tilts[:, axis].sum()), 0.0, high))
@@ -338,18 +337,6 @@ def _waves(calibration: Calibration, without_tilt: bool, side: int) -> float:
         errors = 1 / np.maximum(count - shared, _LEAST)[max(0, 1 + without_tilt - number) :]
         sums += errors.sum(), errors @ errors
     return float(sums[0] ** 2 / sums[1])
-
-
-def _student_quantile(probability: float, freedom: int) -> float:
-    """Quantile of Student's t above the median; of the normal distribution for a freedom of 0."""
-    if not freedom:
-        return NormalDist().inv_cdf(probability)
-    # With t = √f tan θ the density of θ is cos^(f − 1) θ.
-    angles = np.linspace(0, np.pi / 2, 100_001)
-    density = np.cos(angles) ** (freedom - 1)
-    area = np.concatenate([[0], np.cumsum(density[1:] + density[:-1])])
-    angle = np.interp(2 * probability - 1, area / area[-1], angles)
-    return float(np.sqrt(freedom) * np.tan(angle))
 
 
 def _leaves_tilt(calibration: Calibration) -> bool:

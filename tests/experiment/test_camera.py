@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import tracemalloc
-import warnings
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ import equipix
 from equipix import CameraExperiment, errors, metrics
 from equipix.io.frames import read_frames
 from equipix.io.tiff import write_frames
-from equipix.metrics.emva import transfer_of
+from equipix.metrics.emva import dark_lines, transfer_of
 from equipix.report.camera import bounds_of, figures_of
 from given import CAMERA, camera_levels, written_camera
 from reference import emva
@@ -161,18 +160,63 @@ class TestTruth:
             else:
                 assert transfer_of(*given).saturation_dn == 300
 
-    @pytest.mark.parametrize(("column", "limit"), [(0, 0.5 * np.sqrt(10)), (1, 0.5 * 10)])
-    def test_a_line_counts_up_to_its_error_at_the_time_0(self, column, limit):
-        # The scatter is orthogonal to a line: its error at 0 is t s √(1/4 + 2.5²/5), s² = 4 a²/2.
-        times, scatter = np.array([1.0, 2.0, 3.0, 4.0]), np.array([1.0, -1.0, -1.0, 1.0])
-        highest = limit / (4.303 * np.sqrt(2) * np.sqrt(1.5))
+    # A scatter a (1, -1, -1, 1) is orthogonal to a line over these times, and s² = 4 a²/2.
+    EVEN, SCATTER = np.array([1.0, 2.0, 3.0, 4.0]), np.array([1.0, -1.0, -1.0, 1.0])
+
+    @pytest.mark.parametrize("column", [0, 1])
+    @pytest.mark.parametrize("slope", [1.0, -1.0])
+    def test_a_slope_counts_up_to_its_own_error(self, column, slope):
+        # t s/√Sxx with Sxx = 5.
+        highest = np.sqrt(5) / (4.303 * np.sqrt(2))
         for share, known in ((0.99, True), (1.01, False)):
-            off = np.stack([100 + times, np.full(4, 10.0)], axis=1)
-            off[:, column] += share * highest * scatter
-            found = self.of_darks(off, times)
+            off = np.array([100.0, 20.0]) + 1.0 * self.EVEN[:, None]
+            off[:, column] += (slope - 1) * self.EVEN + share * highest * self.SCATTER
+            found = self.of_darks(off, self.EVEN)
             slopes = found.dark_current_mean, found.dark_current_variance
             assert np.isfinite(slopes[column]) == known
             assert np.isfinite(slopes[1 - column])
+
+    @pytest.mark.parametrize("one", [True, False])
+    def test_darks_that_do_not_depend_on_the_time_give_no_dark_current(self, one):
+        """Of one dark for all levels, and of others with noise of 3072 pixels."""
+        times, known = np.linspace(0.5e-3, 10e-3, 14), []
+        rng = np.random.default_rng(2)
+        for _ in range(400):
+            noise = np.zeros((14, 2)) if one else rng.standard_normal((14, 2))
+            off = [100.1, 4.3] + noise * [np.sqrt(4 / 6144), 4 * np.sqrt(2 / 3072)]
+            known.append(np.isfinite(dark_lines(times, off)[0]))
+        # Errors of 95 % leave out at most 5 % of 800 slopes: with five standard errors.
+        assert np.mean(known) <= (0 if one else 0.05 + 5 * np.sqrt(0.05 * 0.95 / 800))
+
+    @pytest.mark.parametrize(
+        ("at_zero", "error", "noise"),
+        [
+            *((10.0, 4.95, 10.0), (10.0, 5.05, 15.0)),
+            *((-10.0, 4.95, -10.0), (-10.0, 5.05, -5.0)),
+            *((0.1, 0.11, 0.1), (-0.1, 0.11, 0.0), (-0.1, 0.13, 4.9)),
+        ],
+    )
+    def test_the_variance_at_the_time_0_counts_up_to_its_own_error(self, at_zero, error, noise):
+        """Positive up to half of it, or of 0.24 DN²; negative it is 0 up to twice its error."""
+        # t s √(1/4 + 2.5²/5).
+        size = error / (4.303 * np.sqrt(2) * np.sqrt(1.5))
+        variance = at_zero + 2.0 * self.EVEN + size * self.SCATTER
+        off = np.stack([100 + self.EVEN, variance], axis=1)
+        found = dark_lines(self.EVEN, off)[1]
+        mean = at_zero + 5.0
+        assert np.isnan(found) == (noise == mean)
+        assert found == pytest.approx(np.nan if noise == mean else noise, nan_ok=True)
+
+    @pytest.mark.parametrize("levels", [3, 4, 8, 14])
+    def test_a_right_camera_with_much_dark_current_contradicts_no_times(self, levels):
+        """Dark variances of 0.3 + 19 t DN², each of two frames of 48x64 pixels."""
+        rng, times, negative = np.random.default_rng(1), np.linspace(0.02, 1.2, levels), 0
+        for _ in range(1000):
+            scatter = 1 + np.sqrt(2 / 3072) * rng.standard_normal(levels)
+            off = np.stack([100 + 4.75 * times, (0.3 + 19 * times) * scatter], axis=1)
+            negative += dark_lines(times, off)[1] < 0
+        # Below -(twice the error of 95 %), of Student's t of one degree of freedom: in 1.3 %.
+        assert negative <= 13 + 3 * np.sqrt(13)
 
     @pytest.mark.parametrize(
         ("darks", "times", "words"),
@@ -298,8 +342,9 @@ def test_findings_name_what_limits_the_figures(tmp_path):
     )
     with pytest.warns(errors.InputWarning) as said:
         found = figures(path)
-    assert [each.kind for each in found.findings] == ["saturation", "quantisation"]
-    assert len(said) == 2
+    # There is no dark current, so that it is not determined.
+    assert [each.kind for each in found.findings] == ["saturation", "spread", "quantisation"]
+    assert len(said) == 3
     bounds = bounds_of(found)
     above = {"saturation_photons", "saturation_e"}
     above |= {
@@ -328,7 +373,7 @@ class TestFindings:
         return {each.kind: each.message for each in figures(path).findings}
 
     def test_times_that_hardly_differ(self, tmp_path):
-        path = replaced(small(tmp_path), "exposure_s", lambda time: 0.01 + 1e-4 * time)
+        path = replaced(small(tmp_path, current=0.0), "exposure_s", lambda t: 0.01 + 1e-4 * t)
         said = self.kinds(path)
         assert [*said] == ["spread"]
         assert "times of 0.01 s and up to 2.75e-06 s more do not determine dark" in said["spread"]
@@ -338,7 +383,7 @@ class TestFindings:
         said = self.kinds(replaced(path, "exposure_s", lambda time: time + 0.02))
         assert "times" in said
         assert "quantisation" not in said
-        assert "at the time 0, which no noise has" in said["times"]
+        assert "at the time 0, below 0 by more than twice its error" in said["times"]
         assert "'exposure_s'" in said["times"]
         found = json.loads(run("emva", path, "--json")[1])
         unknown = {key for key, value in found.items() if value is None} - {"output"}
@@ -553,8 +598,8 @@ def test_one_dark_may_serve_several_levels(camera):
     for k in range(1, 14):
         text = text.replace(f'"d{k}.tif"', '"d0.tif"')
     path.write_text(text)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    # Equal darks at all times determine no dark current.
+    with pytest.warns(errors.InputWarning, match=" do not determine dark current by the mean"):
         assert figures(path).transfer.gain_dn_per_e == pytest.approx(0.25, rel=0.1)
 
 

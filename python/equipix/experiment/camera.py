@@ -27,9 +27,11 @@ from equipix.measured.statistics import FrameStatistics
 from equipix.metrics.emva import (
     MOST_EFFICIENT,
     QUANTISED,
+    TIMES,
     TRANSFER,
     EmvaSpatial,
     EmvaTransfer,
+    dark_lines,
     linear_levels,
     mean_and_variance,
     spatial_of,
@@ -104,7 +106,7 @@ class CameraFigures(ReadOnly):
 
     @property
     def contradicts_times(self) -> bool:
-        """Whether the dark noise has a negative square, though each dark has a clear noise."""
+        """Whether the variance at the time 0 is negative, and that of each dark clear."""
         return self.transfer.dark_noise_dn < 0 and self._least >= QUANTISED
 
     @property
@@ -407,25 +409,32 @@ def _on_times(found: CameraFigures) -> str | None:
         return None
     noise = found.transfer.dark_noise_dn
     return (
-        f"the variance of the darks is from {found._least:.3g} DN² on, and over their exposure "
-        f"times it falls to {-(noise**2):.3g} DN² at the time 0, which no noise has, so dark "
-        "noise, sensitivity threshold and dynamic range are left out: see that each 'exposure_s' "
-        "is that of its frames, in seconds"
+        f"the variance of the darks is {found._least:.3g} DN² or more, and its line over their "
+        f"exposure times is {-(noise**2):.3g} DN² at the time 0, below 0 by more than twice its "
+        "error. So dark noise, sensitivity threshold and dynamic range are left out: see that each "
+        "'exposure_s' is that of its frames, in seconds"
     )
 
 
 def _on_spread(found: CameraFigures) -> str | None:
     """Say that the exposure times differ, but not by enough."""
     times, t = np.unique(found.exposure_s), found.transfer
+    if len(times) < TIMES:
+        return None
     unknown = ["dark current by the mean"] if np.isnan(t.dark_current_mean) else []
-    if np.isnan(t.dark_current_variance) and found._least >= QUANTISED:
-        unknown += ["dark current by the variance", "dark noise at the time 0"]
-    if len(times) < 3 or not unknown:
+    is_clear, noise = found._least >= QUANTISED, ""
+    if is_clear and np.isnan(t.dark_current_variance):
+        unknown += ["dark current by the variance"]
+    if is_clear and np.isnan(dark_lines(found.exposure_s, found.off)[1]):
+        unknown += ["dark noise at the time 0"]
+        noise = "; without them dark noise is that of the darks as they are"
+    if not unknown:
         return None
     return (
         f"exposure times of {times[0]:.6g} s and up to {np.ptp(times):.3g} s more do not determine "
-        f"{', '.join(unknown)}: the error at the time 0 is above half of the noise of a dark. "
-        "Spread the exposure times; without that, dark noise is that of the darks as they are"
+        f"{', '.join(unknown)}: the error, of 95 %, of a dark current is not below its size, or "
+        "that of the variance at the time 0 is above half of it. Add short and long exposure times"
+        f"{noise}"
     )
 
 
@@ -434,10 +443,11 @@ def _on_quantisation(found: CameraFigures) -> str | None:
     if not found.is_quantised:
         return None
     return (
-        f"the temporal dark noise is {found.transfer.dark_noise_dn:.3g} DN, and quantisation hides "
-        f"noise below {QUANTISED**0.5:.2g} DN: dark noise and sensitivity threshold are upper "
-        "bounds, dynamic range is a lower one. Variances give no dark current, and means one with "
-        "errors of rounding. Use a higher gain of the camera"
+        f"the temporal dark noise is {max(found.transfer.dark_noise_dn, 0):.3g} DN, and "
+        f"quantisation hides noise below {QUANTISED**0.5:.2g} DN. So dark noise and sensitivity "
+        "threshold are upper bounds, and dynamic range is a lower bound. Dark current by the "
+        "variance is not known, and dark current by the mean has errors of rounding. Use a higher "
+        "gain of the camera"
     )
 
 

@@ -208,3 +208,15 @@ def fisher_quantile(probability: float, first: float, second: float) -> float:
     square, middle, rest = (1 - b) ** 2 - z**2 * b, (1 - a) * (1 - b), (1 - a) ** 2 - z**2 * a
     root = float(np.sqrt(max(0.0, middle**2 - square * rest)))
     return float(((middle + np.sign(z) * root) / square) ** 3)
+
+
+def student_quantile(probability: float, freedom: int) -> float:
+    """Quantile of Student's t above the median; of the normal distribution for a freedom of 0."""
+    if not freedom:
+        return NormalDist().inv_cdf(probability)
+    # With t = √f tan θ the density of θ is cos^(f − 1) θ.
+    angles = np.linspace(0, np.pi / 2, 100_001)
+    density = np.cos(angles) ** (freedom - 1)
+    area = np.concatenate([[0], np.cumsum(density[1:] + density[:-1])])
+    angle = np.interp(2 * probability - 1, area / area[-1], angles)
+    return float(np.sqrt(freedom) * np.tan(angle))

@@ -21,6 +21,7 @@ from equipix._check import (
 from equipix.errors import InputError
 from equipix.findings import Finding, say
 from equipix.measured.statistics import FrameStatistics
+from equipix.metrics.correctability import student_quantile
 from equipix.metrics.frame_noise import Moments, moments, signed_root
 from equipix.shown import Brief
 
@@ -236,14 +237,14 @@ _LINEAR = (0.05, 0.95)
 QUANTISED = 0.24
 """Least variance of a dark signal in DN²: below it quantisation hides the noise."""
 
-_TIMES = 3
+TIMES = 3
 """Fewest exposure times of which a dark current is determined."""
 
 _HALF = 0.5
-"""Largest error of mean and variance at the time 0, over the noise and the variance of a dark."""
+"""Largest error of the variance of a dark at the time 0, over its value."""
 
-_STUDENT = (12.71, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306)
-"""Student's t that 95 % lie within, by the degrees of freedom from 1 on."""
+_CERTAIN = 0.95
+"""Probability that an error of a line is not exceeded."""
 
 
 @dataclass(frozen=True)
@@ -396,9 +397,10 @@ def emva_transfer(
 
     There a variance without light counts as 0.24 DN² at least. The dark current is the slope of
     the means of the darks over the exposure time, divided by K, and that of their variances,
-    divided by K². A line counts if its error at the time 0, of 95 % by Student's t, is at most half
-    of the noise of a dark, or half of its variance: times that hardly differ determine none. σ_d
-    is then that of the darks as they are.
+    divided by K². A slope counts if its error, of 95 % by Student's t, is below its size: otherwise
+    it may as well be 0. The variance at the time 0 counts if its error is at most half of it, or
+    0.12 DN²; otherwise σ_d is that of the darks as they are. A negative one is 0 up to twice its
+    error. Beyond that it contradicts the exposure times, and `dark_noise_dn` is negative.
 
     References
     ----------
@@ -476,12 +478,12 @@ def transfer_of(
     if not gain > 0:
         raise InputError(f"'frames': the noise does not rise with the signal, the gain is {gain:g}")
     dark_variance, slopes = float(off[:, 1].mean()), np.full(2, np.nan)
-    if times is not None and len(np.unique(times)) >= _TIMES:
-        slopes, (_, at_zero) = _lines(times, off)
+    if times is not None and len(np.unique(times)) >= TIMES:
+        slopes, at_zero = dark_lines(times, off)
         if off[:, 1].min() < QUANTISED:
             slopes[1], dark_variance = np.nan, float(np.fmin(at_zero, off[:, 1].min()))
         elif np.isfinite(at_zero):
-            dark_variance = float(at_zero)
+            dark_variance = at_zero
     efficiency = responsivity / gain
     line = _line(levels[linear], signal[linear])
     fitted = line[0] + line[1] * levels[linear]
@@ -500,19 +502,25 @@ def transfer_of(
     )
 
 
-def _lines(times: Floats, off: Floats) -> tuple[Floats, Floats]:
-    """Slopes of mean and variance (levels, 2) over time, and values at 0; NaN if not determined."""
+def dark_lines(times: Floats, off: Floats) -> tuple[Floats, float]:
+    """Slopes of mean and variance (levels, 2) over time, and the variance at 0; NaN if unknown.
+
+    Errors are those of 95 %. A negative variance that may be 0 by twice its error is 0.
+    """
     middle, freedom = times.mean(), len(times) - 2
     spread = np.sum((times - middle) ** 2)
-    slopes = (times - middle) @ off / spread
-    left = off - off.mean(axis=0) - np.outer(times - middle, slopes)
-    error = np.sqrt(np.sum(left**2, axis=0) / freedom * (1 / len(times) + middle**2 / spread))
-    error *= _STUDENT[min(freedom, len(_STUDENT)) - 1]
-    variance = max(float(off[:, 1].mean()), QUANTISED)
-    known = error <= _HALF * np.array([np.sqrt(variance), variance])
-    lines = np.stack([slopes, off.mean(axis=0) - middle * slopes])
-    slopes, at_zero = np.where(known, lines, np.nan)
-    return slopes, at_zero
+    rise = off - off[0]  # exactly 0, and no slope by rounding, where one dark serves all levels
+    slopes = (times - middle) @ rise / spread
+    left = rise - rise.mean(axis=0) - np.outer(times - middle, slopes)
+    error = np.sqrt(np.sum(left**2, axis=0) / freedom)
+    error *= student_quantile((1 + _CERTAIN) / 2, freedom)
+    known = error / np.sqrt(spread) < np.abs(slopes)
+    at_zero = float(off[:, 1].mean() - middle * slopes[1])
+    of_zero = float(error[1] * np.sqrt(1 / len(times) + middle**2 / spread))
+    if -of_zero / _HALF < at_zero < 0:
+        at_zero = 0.0
+    is_known = of_zero <= _HALF * max(abs(at_zero), QUANTISED)
+    return np.where(known, slopes, np.nan), at_zero if is_known else float("nan")
 
 
 def mean_and_variance(name: str, frames: ArrayLike | FrameStatistics) -> tuple[float, float]:
