@@ -9,7 +9,7 @@ from astropy.io import fits
 
 import equipix
 from equipix import Experiment, LevelExperiment, errors, metrics, simulate
-from equipix.io.frames import Settings, settings
+from equipix.io.frames import Settings, apart, settings
 from equipix.measured.darks import mixed, settings_in, settings_of
 from equipix.measured.means import Averaged
 from given import write_dng
@@ -396,6 +396,34 @@ def test_files_of_one_entry_that_contradict_one_another_are_named(tmp_path, came
     )
     with pytest.raises(errors.FileError, match=words):
         LevelExperiment.load(path).run()
+
+
+@pytest.mark.parametrize(
+    ("times", "known"),
+    [
+        ({"EXPTIME": -1.0}, None),
+        ({"EXPTIME": -1.0, "EXPOSURE": 2.0}, 2.0),
+        ({"EXPTIME": 0.0}, 0.0),
+        ({"EXPTIME": "2"}, None),
+    ],
+)
+def test_a_time_below_0_in_a_header_is_not_known(tmp_path, times, known):
+    for name in ("a.fits", "b.fits"):
+        header = fits.Header(times | {"CCD-TEMP": -10.0})
+        fits.writeto(tmp_path / name, np.ones((16, 20), np.float32), header)
+    assert settings(tmp_path / "a.fits") == Settings(known, -10.0)
+    found = equipix.average(tmp_path / "*.fits")
+    assert found.metadata.get("exposure_s") == known
+    assert found.findings == ()
+
+
+@pytest.mark.parametrize(("index", "near", "far"), [(0, 1.009, 1.011), (1, 1.4, 1.6)])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_settings_differ_beyond_their_tolerance(index, near, far, sign):
+    """Times by 1 % of the larger, temperatures by what is stated; of either sign."""
+    for other, differ in ((1.0, False), (near, False), (far, True), (None, False)):
+        pair = sign, None if other is None else sign * other
+        assert apart(index, *pair, 0.5) is apart(index, *pair[::-1], 0.5) is differ
 
 
 def test_exif_and_tags_give_the_exposure_time(tmp_path):

@@ -106,9 +106,13 @@ def description(path: Path) -> str:
 
 
 def settings(path: Path) -> tuple[float | None, float | None]:
-    """Exposure time in s and temperature in °C, where the headers of a file hold them."""
+    """Exposure time in s and temperature in °C, where the headers of a file hold them.
+
+    Programs write a time below 0, as -1, where they do not know it.
+    """
     with _astropy().open(path) as units:
-        return _keyword(units, "EXPTIME", "EXPOSURE"), _keyword(units, "CCD-TEMP", "SET-TEMP")
+        time = _keyword(units, "EXPTIME", "EXPOSURE", least=0)
+        return time, _keyword(units, "CCD-TEMP", "SET-TEMP")
 
 
 def image_type(path: Path) -> str:
@@ -118,10 +122,11 @@ def image_type(path: Path) -> str:
         return next((value for value in found if isinstance(value, str)), "")
 
 
-def _keyword(units: Any, *names: str) -> float | None:
-    """Value of the first of some keywords that a header holds."""
+def _keyword(units: Any, *names: str, least: float = -math.inf) -> float | None:
+    """First number from the least on that a header holds under some keywords."""
     found = (unit.header[name] for name in names for unit in units if name in unit.header)
-    return next((float(value) for value in found if isinstance(value, int | float)), None)
+    numbers = (float(value) for value in found if isinstance(value, int | float))
+    return next((value for value in numbers if value >= least), None)
 
 
 def header(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any], str]:

@@ -168,7 +168,7 @@ def apart(index: int, one: float | None, other: float | None, tolerance: float) 
     """Whether two exposure times, or with index 1 temperatures, are known and differ."""
     if one is None or other is None:
         return False
-    limit = tolerance if index else _SAME * max(one, other)
+    limit = tolerance if index else _SAME * max(abs(one), abs(other))
     return abs(one - other) > limit + 1e-9 * abs(one)
 
 
