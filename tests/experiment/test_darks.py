@@ -230,6 +230,10 @@ def test_what_exposures_have_in_common_of_their_darks(shares, common, own):
             [("exposure_s = 0.5\n", "exposure_s = 1.0\n")],
         ),
         (
+            r"\[\[dark\]\] 1 and \[\[dark\]\] 2 do not differ",
+            [("exposure_s = 0.5\n", "exposure_s = 1.001\n")],
+        ),
+        (
             r"no dark fits exposure 'p0' of -12 °C within 0.5 K: they have -10 °C",
             [
                 ('.npy"\nexposure_s', '.npy"\ntemperature_c = -10\nexposure_s'),
