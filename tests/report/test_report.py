@@ -634,3 +634,16 @@ def test_short_forms_are_a_line(results, tmp_path):
         assert " at 0x" not in text
         for number in re.findall(r"\d+\.\d+", text):
             assert len(number.replace(".", "").lstrip("0")) <= 5, text
+
+
+@pytest.mark.parametrize("far", [1 + 1e-7, 1e20, -1e30])
+def test_a_histogram_of_equal_values_has_the_one_that_is_far_out(far):
+    """Also of a large map, of which the step is that of a choice of values."""
+    values = np.ones((400, 400))
+    values[1, 1] = far
+    axes = new_figure(4, 3).subplots()
+    draw_histogram(axes, Map("Dark", "DN", values))
+    (bars,) = axes.patches
+    counts, edges, _ = bars.get_data()
+    assert sorted(counts[counts > 0]) == [1, values.size - 1]
+    assert edges[0] <= min(1, far) < max(1, far) <= edges[-1]

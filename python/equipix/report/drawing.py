@@ -162,7 +162,7 @@ def draw_histogram(axes: Axes, shown: Map) -> None:
     if spread > 0:
         bins = max(bins, round(min(3 * (high - low) / spread, _MOST_BINS)))
     # Bins of whole steps between values: others would hold now one value, now two.
-    step = _step(shown.values)
+    step = _step(shown)
     width = step * np.ceil((high - low) / min(bins, _MOST_BINS) / step)
     bins = int(np.floor((high - low + step / 2) / width)) + 1
     counts, edges = np.histogram(
@@ -182,9 +182,11 @@ def draw_histogram(axes: Axes, shown: Map) -> None:
     )
 
 
-def _step(values: Array) -> float:
+def _step(shown: Map) -> float:
     """Smallest difference between distinct values, of a choice of them; tiny if they have none."""
-    known = np.unique(values.flat[:: -(-values.size // _MOST_STEPS)])
+    values = shown.values
+    # With the extremes: a choice of equal values lacks the one that is far out.
+    known = np.unique(np.append(values.flat[:: -(-values.size // _MOST_STEPS)], shown.extremes))
     known = known[np.isfinite(known)]
     steps = np.diff(known)
     rounding = max(_ROUNDING * float(np.ptp(known)) if known.size else 0.0, 1e-300)
