@@ -12,6 +12,7 @@ from equipix import simulate
 from equipix.diagnosis.misfit import misfit
 from equipix.errors import EquipixWarning, MisfitWarning
 from equipix.exposures.exposures import FitOptions
+from equipix.fitting import windows
 from equipix.fitting.residuals import bands, lag_one, sampled
 
 SENSOR, CROSS = (64, 96), equipix.cross_pattern(11, 19)
@@ -303,6 +304,21 @@ def test_noise_that_a_spline_follows_is_no_misfit():
     for seed in range(2):
         frames, shifts = photograph(np.random.default_rng([22, seed]), smooth(), FIVE + BETWEEN)
         assert found_in(frames, shifts) is None
+
+
+def test_noise_is_simulated_once(monkeypatch):
+    """Where both its χ² and the correlation of its neighbours are asked, which is a fit each."""
+    asked = []
+
+    def of_noise(*given):
+        asked.append(windows.of_noise(*given))
+        return asked[-1]
+
+    monkeypatch.setattr("equipix.diagnosis.misfit.of_noise", of_noise)
+    frames, shifts = photograph(np.random.default_rng([22, 0]), smooth(), FIVE + BETWEEN)
+    with pytest.warns(MisfitWarning, match="times as large as the variances predict"):
+        equipix.calibrate(frames, shifts, variance=np.full(5, NOISE**2 / 1.15))
+    assert len(asked) == 1
 
 
 @pytest.mark.study

@@ -1,6 +1,8 @@
 """Whether residuals are those of a right model, and what the likely cause is if not."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache, partial
 
 import numpy as np
 
@@ -22,9 +24,10 @@ from equipix.fitting.residuals import (
 from equipix.fitting.stated_errors import without_shift_errors
 from equipix.fitting.weighted import Weighted
 from equipix.fitting.windows import (
+    OfNoise,
     misplaced,
+    of_noise,
     simulated_chi2,
-    simulated_neighbours,
     squares,
     standing_out,
 )
@@ -122,7 +125,7 @@ def misfit(
     has not come to its minimum, or data without noise, answer neither: of the first it is asked
     only whether an exposure is flipped.
     """
-    inexactness = residuals.inexactness
+    inexactness, simulation = residuals.inexactness, cache(partial(of_noise, weighted, options))
     if weighted.fit.degrees_of_freedom < FEWEST:
         return None
     if not inexactness < 1:
@@ -142,14 +145,14 @@ def misfit(
     low = low and _is_low(chi2, std, weighted.exposures, residuals)
     # F over all measurements needs no degrees of freedom: their number is at most that.
     surely = high and chi2 * residuals.share > 1 + _limit(std)
-    if (high or low) and not surely and not _is_counted(weighted.fit):
-        simulated = simulated_chi2(weighted, options)
-        if simulated is not None:
-            chi2, std = unexplained * simulated.value, simulated.std
-            high, low = _beyond(chi2, std, inexactness)
-            low = low and _is_low(chi2, std, weighted.exposures, residuals)
+    is_open = (high or low) and not surely and not _is_counted(weighted.fit)
+    if is_open and (noise := simulation()) is not None:
+        simulated = simulated_chi2(weighted, noise, options)
+        chi2, std = unexplained * simulated.value, simulated.std
+        high, low = _beyond(chi2, std, inexactness)
+        low = low and _is_low(chi2, std, weighted.exposures, residuals)
     limit = _limit(std) if high or low else None
-    largest = _neighbours(weighted, residuals, options)
+    largest = _neighbours(weighted, residuals, simulation)
     correlated = _is_correlated(largest) and inexactness <= EXACT
     if not correlated:
         # The pattern of one exposure that is flipped is white, and needs no variance to be seen.
@@ -164,24 +167,29 @@ def misfit(
     return Misfit(chi2, limit, largest, *cause)
 
 
-def _neighbours(weighted: Weighted, residuals: Residuals, options: FitOptions) -> Correlation:
+def _neighbours(
+    weighted: Weighted, residuals: Residuals, simulation: Callable[[], OfNoise | None]
+) -> Correlation:
     """Correlation of neighbours along the axis where it is the larger, less that of noise.
 
     A spline follows slow waves of noise better than fast ones, most at the edges, where few
-    exposures see it: the residuals that it leaves are correlated negatively.
+    exposures see it: the residuals that it leaves are correlated negatively. A window of simulated
+    noise has a larger share of edges than the whole sensor, so its correlation is the larger.
     """
     both = lag_one(residuals.values, residuals.share)
     largest = max(both, key=lambda each: abs(each.z))
     if weighted.fit.beam.coefficients is None or largest.z > 0 or not _is_correlated(largest):
         return largest
-    of_noise = simulated_neighbours(weighted, options) or ()
-    pairs = zip(both, of_noise, strict=False)
-    return max((_less(*pair) for pair in pairs), key=lambda each: abs(each.z), default=largest)
+    if (noise := simulation()) is None:
+        return largest
+    simulated = lag_one(noise.residuals.values, noise.residuals.share)
+    pairs = zip(both, simulated, strict=True)
+    return max((_less(*pair) for pair in pairs), key=lambda each: abs(each.z))
 
 
-def _less(found: Correlation, of_noise: Correlation) -> Correlation:
+def _less(found: Correlation, simulated: Correlation) -> Correlation:
     """A correlation, less the part that it has in common with that of noise."""
-    share = min(max(of_noise.size / found.size, 0.0), 1.0) if found.size else 0.0
+    share = min(max(simulated.size / found.size, 0.0), 1.0) if found.size else 0.0
     return Correlation(*((1 - share) * each for each in found))
 
 

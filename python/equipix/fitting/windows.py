@@ -215,9 +215,16 @@ class Chi2(NamedTuple):
     std: float
 
 
-@if_there_is_light()
-def simulated_chi2(weighted: Weighted, options: FitOptions) -> Chi2 | None:
-    """Reduced χ² by the degrees of freedom that simulated measurements have; None without such.
+class OfNoise(NamedTuple):
+    """A central window with its fit, the fit of simulated noise there, and what that leaves."""
+
+    part: Weighted
+    other: Weighted
+    residuals: Residuals
+
+
+def simulated_chi2(weighted: Weighted, found: OfNoise, options: FitOptions) -> Chi2:
+    """Reduced χ² by the degrees of freedom that simulated measurements have.
 
     Notes
     -----
@@ -226,17 +233,13 @@ def simulated_chi2(weighted: Weighted, options: FitOptions) -> Chi2 | None:
     fit, over what it is expected to be, is the factor by which degrees of freedom are counted
     wrongly: a spline's penalty determines cells that only noisy pixels see, and a prior on M dim
     pixels. That of the whole sensor is divided by it [1]_. Pixels whose M follows the prior are
-    left out of F. None where the window has too few degrees of freedom, or where the fit of the
-    simulation is not exact enough.
+    left out of F.
 
     References
     ----------
     .. [1] B. Efron, R. J. Tibshirani, "An Introduction to the Bootstrap" (1993), section 6.5: the
        parametric bootstrap.
     """
-    found = _of_noise(weighted, options)
-    if found is None:
-        return None
     part, other, _ = found
     free = tested(part.fit)
     factor = squares(other.exposures, other.fit, free, options) / part.expected_misfit
@@ -246,19 +249,11 @@ def simulated_chi2(weighted: Weighted, options: FitOptions) -> Chi2 | None:
 
 
 @if_there_is_light()
-def simulated_neighbours(weighted: Weighted, options: FitOptions) -> tuple[Correlation, ...] | None:
-    """Correlation of neighbouring residuals of simulated noise on a central window, by axis.
+def of_noise(weighted: Weighted, options: FitOptions) -> OfNoise | None:
+    """Fit simulated noise on a central window.
 
-    The window has a larger share of edges than the whole sensor, so it is the larger.
+    None where the window has too few degrees of freedom, or the fit is not exact enough.
     """
-    found = _of_noise(weighted, options)
-    return None if found is None else lag_one(found[2].values, found[2].share)
-
-
-def _of_noise(
-    weighted: Weighted, options: FitOptions
-) -> tuple[Weighted, Weighted, Residuals] | None:
-    """A central window, the fit of simulated noise there and its residuals, if exact enough."""
     # Coordinate descent would take thousands of sweeps for large-scale errors of this fit alone.
     options = dataclasses.replace(options, progress=None, method="multiscale")
     window, fit = window_of(weighted.exposures, weighted.fit)
@@ -269,7 +264,8 @@ def _of_noise(
     other = Weighted(right, right.fit(options, part.fit), None)
     residuals = sampled(other, workers=options.workers)
     exact = residuals.inexactness <= EXACT
-    return (part, other, residuals) if part.fit.degrees_of_freedom >= FEWEST and exact else None
+    found = OfNoise(part, other, residuals)
+    return found if part.fit.degrees_of_freedom >= FEWEST and exact else None
 
 
 def simulated(part: Weighted, options: FitOptions, sign: int = 1) -> Exposures:
