@@ -184,7 +184,7 @@ class TestTruth:
         for _ in range(400):
             noise = np.zeros((14, 2)) if one else rng.standard_normal((14, 2))
             off = [100.1, 4.3] + noise * [np.sqrt(4 / 6144), 4 * np.sqrt(2 / 3072)]
-            known.append(np.isfinite(dark_lines(times, off)[0]))
+            known.append(np.isfinite(dark_lines(times, off).slopes))
         # Errors of 95 % leave out at most 5 % of 800 slopes: with five standard errors.
         assert np.mean(known) <= (0 if one else 0.05 + 5 * np.sqrt(0.05 * 0.95 / 800))
 
@@ -202,7 +202,7 @@ class TestTruth:
         size = error / (4.303 * np.sqrt(2) * np.sqrt(1.5))
         variance = at_zero + 2.0 * self.EVEN + size * self.SCATTER
         off = np.stack([100 + self.EVEN, variance], axis=1)
-        found = dark_lines(self.EVEN, off)[1]
+        found = dark_lines(self.EVEN, off).at_zero
         mean = at_zero + 5.0
         assert np.isnan(found) == (noise == mean)
         assert found == pytest.approx(np.nan if noise == mean else noise, nan_ok=True)
@@ -214,7 +214,7 @@ class TestTruth:
         for _ in range(1000):
             scatter = 1 + np.sqrt(2 / 3072) * rng.standard_normal(levels)
             off = np.stack([100 + 4.75 * times, (0.3 + 19 * times) * scatter], axis=1)
-            negative += dark_lines(times, off)[1] < 0
+            negative += dark_lines(times, off).at_zero < 0
         # Below -(twice the error of 95 %), of Student's t of one degree of freedom: in 1.3 %.
         assert negative <= 13 + 3 * np.sqrt(13)
 
@@ -377,6 +377,19 @@ class TestFindings:
         said = self.kinds(path)
         assert [*said] == ["spread"]
         assert "times of 0.01 s and up to 2.75e-06 s more do not determine dark" in said["spread"]
+
+    def test_a_dark_current_that_may_be_0_is_a_bound(self, tmp_path, run):
+        path = small(tmp_path, current=0.0)
+        found = json.loads(run("emva", path, "--json")[1])
+        times, off = figures(path).exposure_s, figures(path).off
+        # The upper end of a line's slope, by Student's t of 16 degrees of freedom.
+        for column, by in enumerate(("mean", "variance")):
+            (slope, _), covariance = np.polyfit(times, off[:, column], 1, cov=True)
+            below = (slope + 2.1199 * covariance[0, 0] ** 0.5) / found["gain_dn_per_e"] ** (
+                column + 1
+            )
+            assert found["bounds"][f"dark_current_{by}_e_per_s"] == "below"
+            assert found[f"dark_current_{by}_e_per_s"] == pytest.approx(below, rel=1e-4)
 
     def test_times_that_contradict_the_noise(self, tmp_path, run):
         path = small(tmp_path, current=2e5, read=2.0)

@@ -361,6 +361,24 @@ class TestLimits:
         assert (check.value, check.verdict) == ("not known", "FAIL")
 
     @pytest.mark.parametrize(
+        ("limits", "value", "told", "words", "passed"),
+        [
+            (CameraLimits(dark_noise_e=1), 0.9, "below", "below 0.9", True),
+            (CameraLimits(dark_noise_e=1), 1.1, "below", "below 1.1", False),
+            (CameraLimits(dark_noise_e=1), 0.9, "above", "above 0.9", False),
+            (CameraLimits(snr_max_db=38), 39, "above", "above 39", True),
+            (CameraLimits(snr_max_db=38), 37, "above", "above 37", False),
+            (CameraLimits(snr_max_db=38), 39, "below", "below 39", False),
+            (CameraLimits(dsnu_e=1), np.nan, "not measured", "not measured", False),
+        ],
+    )
+    def test_a_bound_passes_where_all_that_it_allows_does(self, limits, value, told, words, passed):
+        (name,) = limits.model_dump(exclude={"findings"}, exclude_none=True)
+        checks = checked(limits, {name: value}, (), {name: told})
+        (check,) = (each for each in checks if each.name == name)
+        assert (check.value, check.passed) == (words, passed)
+
+    @pytest.mark.parametrize(
         ("text", "words"),
         [
             (
@@ -527,6 +545,30 @@ class TestCamera:
         assert [each["verdict"] for each in found] == ["FAIL", "PASS"]
         limits.write_text("[camera]\ndark_noise_e = 1e3\n")
         assert run(*asked)[0] == 0
+
+    def test_what_was_not_measured_says_what_to_add(self, tmp_path, run):
+        """And a bound is shown as one. All of it fails: a limit asks for the figure."""
+        limits = tmp_path / "limits.toml"
+        keys = ("dsnu_e", "prnu_percent", "dark_current_mean_e_per_s")
+        lines = ["[camera]", *(f"{key} = 1e9" for key in (*keys, "dark_noise_e"))]
+        limits.write_text("\n".join(lines))
+        path = written_camera(tmp_path, count=6, spatial=0, gain=0.01)
+        path.write_text(re.sub(r"exposure_s = .*", "exposure_s = 0.01", path.read_text()))
+        asked = ("emva", path, "--limits", limits)
+        judged = json.loads(run(*asked, "--json")[1])["limits"]
+        found = {each["figure"]: (each["found"], each["verdict"]) for each in judged}
+        assert found["dsnu_e"] == found["prnu_percent"] == ("not measured (add [spatial])", "FAIL")
+        assert found["dark_current_mean_e_per_s"] == (
+            *("not measured (add levels and darks of 3 exposure times)", "FAIL"),
+        )
+        number, verdict = found["dark_noise_e"]
+        assert re.fullmatch(r"below \d+\.?\d*", number)
+        assert verdict == "PASS"
+        status, printed, told = run(*asked, "--check")
+        assert status == 1
+        assert "prnu_percent is not measured (add [spatial]), expected at most 1e+09" in told
+        assert "dark current by the mean" in printed
+        assert "dark_noise_e" not in told
 
     def test_planes_are_parts_and_columns(self, tmp_path, run):
         path, out = written_camera(tmp_path, cfa="RGGB", count=18, spatial=0), tmp_path / "it.html"

@@ -421,20 +421,23 @@ def _on_spread(found: CameraFigures) -> str | None:
     times, t = np.unique(found.exposure_s), found.transfer
     if len(times) < TIMES:
         return None
+    is_clear = found._least >= QUANTISED
     unknown = ["dark current by the mean"] if np.isnan(t.dark_current_mean) else []
-    is_clear, noise = found._least >= QUANTISED, ""
     if is_clear and np.isnan(t.dark_current_variance):
         unknown += ["dark current by the variance"]
-    if is_clear and np.isnan(dark_lines(found.exposure_s, found.off)[1]):
+    reasons = ["the error, of 95 %, of a dark current is not below its size, so it may be 0"]
+    reasons = reasons if unknown else []
+    if is_clear and np.isnan(dark_lines(found.exposure_s, found.off).at_zero):
         unknown += ["dark noise at the time 0"]
-        noise = "; without them dark noise is that of the darks as they are"
+        reasons += [
+            "the error of the variance at the time 0 is above half of it, so dark noise is that of "
+            "the darks as they are"
+        ]
     if not unknown:
         return None
     return (
         f"exposure times of {times[0]:.6g} s and up to {np.ptp(times):.3g} s more do not determine "
-        f"{', '.join(unknown)}: the error, of 95 %, of a dark current is not below its size, or "
-        "that of the variance at the time 0 is above half of it. Add short and long exposure times"
-        f"{noise}"
+        f"{', '.join(unknown)}: {', and '.join(reasons)}. Add short and long exposure times"
     )
 
 
@@ -442,12 +445,15 @@ def _on_quantisation(found: CameraFigures) -> str | None:
     """Say that the noise of the dark is hidden by rounding."""
     if not found.is_quantised:
         return None
+    hidden = (
+        "Dark current by the variance is not known, and dark current by the mean has errors of "
+        "rounding. "
+    )
     return (
         f"the temporal dark noise is {max(found.transfer.dark_noise_dn, 0):.3g} DN, and "
         f"quantisation hides noise below {QUANTISED**0.5:.2g} DN. So dark noise and sensitivity "
-        "threshold are upper bounds, and dynamic range is a lower bound. Dark current by the "
-        "variance is not known, and dark current by the mean has errors of rounding. Use a higher "
-        "gain of the camera"
+        "threshold are upper bounds, and dynamic range is a lower bound. "
+        f"{hidden if found._least < QUANTISED else ''}Use a higher gain of the camera"
     )
 
 

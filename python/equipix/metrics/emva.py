@@ -479,7 +479,7 @@ def transfer_of(
         raise InputError(f"'frames': the noise does not rise with the signal, the gain is {gain:g}")
     dark_variance, slopes = float(off[:, 1].mean()), np.full(2, np.nan)
     if times is not None and len(np.unique(times)) >= TIMES:
-        slopes, at_zero = dark_lines(times, off)
+        slopes, _, at_zero = dark_lines(times, off)
         if off[:, 1].min() < QUANTISED:
             slopes[1], dark_variance = np.nan, float(np.fmin(at_zero, off[:, 1].min()))
         elif np.isfinite(at_zero):
@@ -502,11 +502,20 @@ def transfer_of(
     )
 
 
-def dark_lines(times: Floats, off: Floats) -> tuple[Floats, float]:
-    """Slopes of mean and variance (levels, 2) over time, and the variance at 0; NaN if unknown.
+class DarkLines(NamedTuple):
+    """Lines through the means and variances of darks over the exposure time.
 
-    Errors are those of 95 %. A negative variance that may be 0 by twice its error is 0.
+    The slopes, NaN where their error of 95 % leaves the sign open; what they are below by that; and
+    the variance at the time 0, NaN where its error is too large.
     """
+
+    slopes: Floats
+    below: Floats
+    at_zero: float
+
+
+def dark_lines(times: Floats, off: Floats) -> DarkLines:
+    """Fit lines to means and variances (levels, 2) of darks at three times or more."""
     middle, freedom = times.mean(), len(times) - 2
     spread = np.sum((times - middle) ** 2)
     rise = off - off[0]  # exactly 0, and no slope by rounding, where one dark serves all levels
@@ -514,13 +523,15 @@ def dark_lines(times: Floats, off: Floats) -> tuple[Floats, float]:
     left = rise - rise.mean(axis=0) - np.outer(times - middle, slopes)
     error = np.sqrt(np.sum(left**2, axis=0) / freedom)
     error *= student_quantile((1 + _CERTAIN) / 2, freedom)
-    known = error / np.sqrt(spread) < np.abs(slopes)
+    of_slopes = error / np.sqrt(spread)
+    known = of_slopes < np.abs(slopes)
     at_zero = float(off[:, 1].mean() - middle * slopes[1])
     of_zero = float(error[1] * np.sqrt(1 / len(times) + middle**2 / spread))
-    if -of_zero / _HALF < at_zero < 0:
+    if -of_zero / _HALF < at_zero < 0:  # 0, by its error
         at_zero = 0.0
     is_known = of_zero <= _HALF * max(abs(at_zero), QUANTISED)
-    return np.where(known, slopes, np.nan), at_zero if is_known else float("nan")
+    known_slopes = np.where(known, slopes, np.nan)
+    return DarkLines(known_slopes, slopes + of_slopes, at_zero if is_known else float("nan"))
 
 
 def mean_and_variance(name: str, frames: ArrayLike | FrameStatistics) -> tuple[float, float]:

@@ -10,7 +10,15 @@ import numpy as np
 
 from equipix._check import Floats
 from equipix.experiment.camera import CameraFigures
-from equipix.metrics.emva import QUANTISED, TRANSFER, Split, high_passed, linear_levels
+from equipix.metrics.emva import (
+    QUANTISED,
+    TIMES,
+    TRANSFER,
+    Split,
+    dark_lines,
+    high_passed,
+    linear_levels,
+)
 from equipix.report.drawing import draw_histogram, draw_spectrum
 from equipix.report.limits import CameraLimits, Check, checked
 from equipix.report.maps import Map
@@ -22,6 +30,8 @@ if TYPE_CHECKING:
 
 _WHOLE = 1e4
 """Values from here on are written as whole numbers."""
+
+_NO_TIMES = f"not measured (add levels and darks of {TIMES} exposure times)"
 
 _FINE: Any = {"linewidth": 0.8}
 
@@ -91,9 +101,23 @@ def figures_of(found: CameraFigures) -> Iterator[Figure]:
         yield from _parts("dsnu", "_e", "e⁻", dsnu)
         yield from _parts("prnu", "_percent", "%", Split(*(100 * each for each in prnu)))
     yield Figure("linearity_error_percent", "linearity error", "%", 100 * t.linearity_error)
-    for by in ("mean", "variance"):
-        current = getattr(t, f"dark_current_{by}")
-        yield Figure(f"dark_current_{by}_e_per_s", f"dark current by the {by}", "e⁻/s", current)
+    yield from _dark_currents(found)
+
+
+def _dark_currents(found: CameraFigures) -> Iterator[Figure]:
+    """Dark currents; an upper bound of one that may be 0 by its error."""
+    t, few = found.transfer, len(np.unique(found.exposure_s)) < TIMES
+    gains = t.gain_dn_per_e, t.gain_dn_per_e**2
+    below = np.full(2, np.nan) if few else dark_lines(found.exposure_s, found.off).below / gains
+    if found.off[:, 1].min() < QUANTISED:
+        below[1] = np.nan
+    for by, bound in zip(("mean", "variance"), below.tolist(), strict=True):
+        value, told = getattr(t, f"dark_current_{by}"), ""
+        if np.isnan(value) and few:
+            told = _NO_TIMES
+        elif np.isnan(value) and bound > 0:  # 0 of equal darks, which tell nothing
+            value, told = bound, "below"
+        yield Figure(f"dark_current_{by}_e_per_s", f"dark current by the {by}", "e⁻/s", value, told)
 
 
 def _parts(kind: str, ending: str, unit: str, split: Split) -> Iterator[Figure]:
@@ -145,7 +169,11 @@ def _side_by_side(planes: dict[str, CameraFigures]) -> Table:
 
 def camera_checks(found: CameraFigures, limits: CameraLimits) -> list[Check]:
     """Judge the figures of a plane by limits."""
-    return checked(limits, {each.key: each.value for each in figures_of(found)}, found.findings)
+    figures = {each.key: each for each in figures_of(found)}
+    told = {key: each.told for key, each in figures.items()}
+    if found.spatial is None:
+        told |= dict.fromkeys(("dsnu_e", "prnu_percent"), "not measured (add [spatial])")
+    return checked(limits, {key: each.value for key, each in figures.items()}, found.findings, told)
 
 
 def camera_parts(name: str, planes: dict[str, CameraFigures], limits: CameraLimits) -> list[Part]:

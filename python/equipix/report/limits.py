@@ -94,11 +94,11 @@ class CameraLimits(FindingLimits):
     threshold_e: AtMost = _most("electrons", "absolute sensitivity threshold", 12.0)
     saturation_e: AtLeast = _least("electrons", "saturation capacity", 6000.0)
     dynamic_range_db: AtLeast = _least("dB", "dynamic range", 55.0)
-    dsnu_e: AtMost = _most("electrons", "DSNU", 5.0)
-    prnu_percent: AtMost = _most("percent", "PRNU", 1.0)
+    dsnu_e: AtMost = _most("electrons", "DSNU; needs [spatial]", 5.0)
+    prnu_percent: AtMost = _most("percent", "PRNU; needs [spatial]", 1.0)
     linearity_error_percent: AtMost = _most("percent", "linearity error", 1.0)
     dark_current_mean_e_per_s: AtMost = _most(
-        "electrons per second", "dark current by the mean", 100.0
+        "electrons per second", "dark current by the mean; needs three exposure times", 100.0
     )
 
 
@@ -151,18 +151,26 @@ def verdict_of(checks: Iterable[Check]) -> str:
 
 
 def checked(
-    limits: FindingLimits, figures: Mapping[str, Any], findings: Iterable[Finding] | None
+    limits: FindingLimits,
+    figures: Mapping[str, Any],
+    findings: Iterable[Finding] | None,
+    told: Mapping[str, str] | None = None,
 ) -> list[Check]:
     """Compare figures and findings with limits.
 
     A figure that is not known fails. None is one that the result does not have: it is not judged.
+    What is `told` of a figure is "below" or "above" of a bound, or why it is not known.
     """
     fields = type(limits).model_fields
     return [
         _of_findings(findings, limit)
         if name == "findings"
         else _of_figure(
-            name, limit, figures.get(name, math.nan), least="at least" in fields[name].metadata
+            name,
+            limit,
+            figures.get(name, math.nan),
+            (told or {}).get(name, ""),
+            least="at least" in fields[name].metadata,
         )
         for name, limit in limits
         if limit is not None
@@ -178,7 +186,7 @@ def _of_findings(findings: Iterable[Finding] | None, severest: Severity) -> Chec
     return Check("findings", told, wanted, worst <= SEVERITIES.index(severest))
 
 
-def _of_figure(name: str, limit: Any, value: Any, *, least: bool) -> Check:
+def _of_figure(name: str, limit: Any, value: Any, told: str, *, least: bool) -> Check:
     if isinstance(limit, bool):
         return Check(name, _words(value), _words(limit), value is limit)
     low, high = limit if isinstance(limit, list) else (-math.inf, limit)
@@ -189,7 +197,17 @@ def _of_figure(name: str, limit: Any, value: Any, *, least: bool) -> Check:
         return Check(name, _NONE, wanted, None)
     values = [*value.values()] if isinstance(value, dict) else [value]
     passed = all(low <= each <= high for each in values)
-    return Check(name, ", ".join(map(_words, values)), wanted, passed)
+    words = ", ".join(map(_words, values))
+    if told in _OPEN:
+        # All values that a bound allows must pass.
+        passed, words = passed and low <= _OPEN[told] <= high, f"{told} {words}"
+    elif told and not passed:
+        words = told
+    return Check(name, words, wanted, passed)
+
+
+_OPEN = {"below": -math.inf, "above": math.inf}
+"""The end that a bound leaves open."""
 
 
 _NONE = "this result has none"
