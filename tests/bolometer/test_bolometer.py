@@ -362,7 +362,10 @@ class TestRefusals:
             ),
             ({"black_bodies": FRAMES}, "'black_bodies' is no pair"),
             ({"black_bodies": (FRAMES, FRAMES[:2])}, r"'hot' has shape \(2, 2, 3\)"),
-            ({"black_bodies": (FRAMES, FRAMES)}, "'cold' and 'hot' at state 0 differ by 0 DN"),
+            (
+                {"black_bodies": (FRAMES, FRAMES)},
+                r"at state 0 \(states count from 0\) differ by 0 DN",
+            ),
         ],
     )
     def test_wrong_references_are_refused(self, given, message):
@@ -437,12 +440,17 @@ class TestBodiesOfOtherStates:
 
     def test_one_in_reversed_order_is_refused(self, series):
         celsius, shutter, cold, hot = series
-        with pytest.raises(errors.InputError, match=r"darker by \d+ DN at state 4, expected one"):
+        with pytest.raises(
+            errors.InputError,
+            match=r"darker by \d+ DN at state 4 \(states count from 0\), expected one",
+        ):
             bolometer.fit(shutter, celsius, 2.0, black_bodies=(cold, hot[::-1]))
 
     def test_both_in_reversed_order_have_the_patterns_of_other_shutters(self, series):
         celsius, shutter, cold, hot = series
-        with pytest.warns(errors.MisfitWarning, match="'shutter' at state 4"):
+        with pytest.warns(
+            errors.MisfitWarning, match=r"'shutter' at state 4 \(states count from 0\)"
+        ):
             found = bolometer.fit(shutter, celsius, 2.0, black_bodies=(cold[::-1], hot[::-1]))
         assert [each.message[:6] for each in found.findings] == ["'cold'", "'hot' "]
 
@@ -589,7 +597,10 @@ class TestSaturatedReferences:
     def test_many_values_at_the_highest_one_are_told(self):
         shutter = self.frames().astype(float)
         shutter[3, :4] = 65535.0
-        with pytest.warns(errors.InputWarning, match="128 values of 'shutter' at state 3 are"):
+        with pytest.warns(
+            errors.InputWarning,
+            match=r"128 values of 'shutter' at state 3 \(states count from 0\) are",
+        ):
             bolometer.fit(shutter, [0, 10, 20, 30, 40], 2.0, order=1)
 
     def test_nothing_else_than_saturated_pixels_is_refused(self):

@@ -22,6 +22,8 @@ from equipix.measured.statistics import FrameStatistics
 _BODIES = ("cold", "hot")
 """Names of the black bodies in messages."""
 
+_COUNTED = "(states count from 0)"
+
 _NEARER = 0.5
 """Distance of a pattern to that of another state, over that to its own, from which it is of it."""
 
@@ -224,9 +226,9 @@ def _clipping(name: str, references: Measured, good: Bools) -> str | None:
         found = clipping(np.where(good, frame, np.nan))
         if found is not None:
             return (
-                f"{found.values} values of '{name}' at state {k} are exactly {found.level:.10g}, "
-                "the highest one: they probably saturate and count as valid: exclude their pixels "
-                "by 'mask', or give averages with a 'saturation'"
+                f"{found.values} values of '{name}' at state {k} {_COUNTED} are exactly "
+                f"{found.level:.10g}, the highest one: they probably saturate and count as valid: "
+                "exclude their pixels by 'mask', or give averages with a 'saturation'"
             )
     return None
 
@@ -253,8 +255,8 @@ def _on_bodies(bodies: Sequence[Measured], shown: Observed) -> Findings:
             continue
         k = int(np.flatnonzero(of_shutter != own)[0])
         words = (
-            f"'{name}' at state {k} has the pattern of 'shutter' at state {of_shutter[k]}: give "
-            f"the references of '{name}' in the order of 'substrate_c'"
+            f"'{name}' at state {k} has the pattern of 'shutter' at state {of_shutter[k]} "
+            f"{_COUNTED}: give the references of '{name}' in the order of 'substrate_c'"
         )
         found.append(Finding("states", words, "misfit"))
     return tuple(found)
@@ -276,16 +278,17 @@ def response_of(bodies: Sequence[Measured], good: Bools) -> tuple[Floats, Floats
     if mean.min() < 0 < mean.max():
         raise InputError(
             f"'hot' is brighter than 'cold' by {mean.max():.4g} DN at state {mean.argmax()}, and "
-            f"darker by {-mean.min():.4g} DN at state {mean.argmin()}, expected one sign at all "
-            "states: give the references of 'cold' and of 'hot' in the order of 'substrate_c'"
+            f"darker by {-mean.min():.4g} DN at state {mean.argmin()} {_COUNTED}, expected one "
+            "sign at all states: give the references of 'cold' and of 'hot' in the order of "
+            "'substrate_c'"
         )
     weak = np.flatnonzero(~(np.abs(mean) > scatter))
     if weak.size:
         k = int(weak[0])
         raise InputError(
-            f"'cold' and 'hot' at state {k} differ by {mean[k]:.4g} DN in the mean and by "
-            f"{scatter[k]:.4g} DN rms between pixels, expected a difference that all pixels see: "
-            "take black bodies further apart, and see that both are of this state"
+            f"'cold' and 'hot' at state {k} {_COUNTED} differ by {mean[k]:.4g} DN in the mean and "
+            f"by {scatter[k]:.4g} DN rms between pixels, expected a difference that all pixels "
+            "see: take black bodies further apart, and see that both are of this state"
         )
     of_cold, of_hot = (_noise(each, good) for each in bodies)
     variance = None if of_cold is None or of_hot is None else (of_cold + of_hot) / mean**2
