@@ -686,13 +686,31 @@ class TestMisfit:
             more = np.concatenate([exact, times * sigma * rng.standard_normal((1, *SHAPE))])
             levels = curves(more) + 5 * rng.standard_normal((len(LEVELS), *SHAPE))
             found = nuc.fit(levels, order=order, variance=np.full(len(LEVELS), 25.0), cfa=cfa)
-            assert found.reduced_chi2.mean() < 1.6
+            # Of f squares one has the variance 1 + s², so χ² alone, below 2, would name nothing.
+            freedom, part = len(LEVELS) - order - 1, 1 + times**2
+            scatter = np.sqrt(2 * (freedom - 1 + part**2) / np.prod(SHAPE)) / freedom
+            chi2 = (freedom - 1 + part) / freedom
+            assert found.reduced_chi2.mean() == pytest.approx(chi2, abs=5 * scatter)
             assert ("misfit" in [each.kind for each in found.findings]) is expected
         ratio = found.metadata["next_power"]["ratio"]
         pixels = SHAPE[0] * SHAPE[1] / (4 if cfa else 1)
         # Of a colour the largest of three ratios; its own error beside that of noise alone.
         assert ratio == pytest.approx(1 + times**2, rel=5 * 2.33 * np.sqrt(2 / pixels))
         assert f"order={order + 1} or order='auto'" in found.findings[-1].message
+
+    @pytest.mark.parametrize("count", [3, 4])
+    @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
+    def test_the_error_of_the_ratio_of_the_next_order_is_that_of_its_medians(self, count):
+        """Without residuals it is one median, and over those of one degree of freedom two."""
+        rng, shape = np.random.default_rng(27), (24, 32)
+        levels = curves(truth(1, rng, shape), LEVELS[:count])
+        levels += 5 * rng.standard_normal(levels.shape)
+        found = nuc.fit(levels, order=1, variance=np.full(count, 5.0)).metadata["next_power"]
+        squares = rng.standard_normal((2000, count - 2, *shape)) ** 2
+        medians = np.median(squares, axis=(2, 3)) / 0.4549
+        ratios = medians[:, 0] / (medians[:, 1] if count > 3 else 1)
+        # A standard deviation of 2000 values has 1.6 %, and a ratio of these adds (8 %)²/2.
+        assert found["standard_error"] == pytest.approx(np.std(ratios), rel=4 / np.sqrt(4000))
 
     def test_no_order_is_named_where_noise_is_understated(self):
         rng = np.random.default_rng(24)

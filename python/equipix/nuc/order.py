@@ -108,14 +108,20 @@ def next_power(levels: Levels, order: int, *, workers: int | None) -> dict[str, 
     ratio is above 2. Pixels whose curves have this order give 1. The residuals of the next order
     give the scale of the noise, so that noise that was understated has no part in it. What all
     pixels have in common is of V̄, not of theirs.
+
+    Both are medians over N pixels, independent of each other. With c = 2.33 the first has the
+    relative standard error c/√N, that of residuals of one degree of freedom the same, of more less:
+    √(c²/N + c²/N) of their ratio at most. Without residuals it is c/√N.
     """
     deviation, variances, misfit, _ = levels.fit(order + 1, "offset", workers=workers)
     coefficient, freedom = deviation[-1][levels.good], len(levels) - (order + 2)
     squares = (coefficient - np.median(coefficient)) ** 2 / variances[-1][levels.good]
-    ratio = typical(squares, np.array(1))
+    ratio, medians = typical(squares, np.array(1)), 1
     if freedom > 0:
         ratio /= typical(misfit[levels.good] / freedom, np.array(freedom))
-    return {"ratio": ratio, "standard_error": _MEDIAN_ERROR * float(np.sqrt(2 / squares.size))}
+        medians = 2
+    error = _MEDIAN_ERROR * float(np.sqrt(medians / squares.size))
+    return {"ratio": ratio, "standard_error": error}
 
 
 def _squares(levels: Levels, held: Array, order: int, by: By, workers: int | None) -> Floats:
