@@ -209,10 +209,10 @@ class TestTruth:
 
     @pytest.mark.parametrize("levels", [3, 4, 8, 14])
     def test_a_right_camera_with_much_dark_current_contradicts_no_times(self, levels):
-        """Dark variances of 0.3 + 19 t DN², each of two frames of 48x64 pixels."""
+        """Dark variances of 0.3 + 19 t DN², each of two frames of 16x20 pixels."""
         rng, times, negative = np.random.default_rng(1), np.linspace(0.02, 1.2, levels), 0
         for _ in range(1000):
-            scatter = 1 + np.sqrt(2 / 3072) * rng.standard_normal(levels)
+            scatter = 1 + np.sqrt(2 / 320) * rng.standard_normal(levels)
             off = np.stack([100 + 4.75 * times, (0.3 + 19 * times) * scatter], axis=1)
             negative += dark_lines(times, off).at_zero < 0
         # Below -(twice the error of 95 %), of Student's t of one degree of freedom: in 1.3 %.

@@ -277,8 +277,9 @@ class EmvaTransfer(Brief):
         quantisation hides it: this number and `read_noise_e` then state no more than that they are
         below 0.49 DN and 0.40/K.
     dark_current_mean, dark_current_variance : float
-        Electrons per second by the means and by the variances of the darks; NaN where the exposure
-        times do not determine it. By the variances also NaN where quantisation hides one.
+        Electrons per second by the means and by the variances of the darks; NaN of fewer than three
+        exposure times, and where it may be 0 by its error of 95 %. By the variances also NaN where
+        quantisation hides one.
     """
 
     gain_dn_per_e: float
