@@ -1,6 +1,7 @@
 """How good a correction is: spatial over temporal noise, and for how long."""
 
 from dataclasses import dataclass
+from functools import cache
 from statistics import NormalDist
 
 import numpy as np
@@ -210,6 +211,7 @@ def fisher_quantile(probability: float, first: float, second: float) -> float:
     return float(((middle + np.sign(z) * root) / square) ** 3)
 
 
+@cache
 def student_quantile(probability: float, freedom: int) -> float:
     """Quantile of Student's t above the median; of the normal distribution for a freedom of 0."""
     if not freedom:
