@@ -106,7 +106,7 @@ class TestJson:
         def exhausted(*_, **__):
             raise MemoryError
 
-        monkeypatch.setattr("equipix.measured.average.find_files", exhausted)
+        monkeypatch.setattr("equipix.measured.average.frame_files", exhausted)
         status, _, err = run("average", frames, "-o", tmp_path / "a.npz", "--json")
         assert status == 1
         assert json.loads(err)["code"] == "memory"
@@ -121,7 +121,7 @@ class TestJson:
         def stopped(*_, **__):
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("equipix.measured.average.find_files", stopped)
+        monkeypatch.setattr("equipix.measured.average.frame_files", stopped)
         status, out, err = run("average", frames, "-o", tmp_path / "a.npz", *given)
         assert (status, out) == (130, "")
         told = {"error": "stopped by Ctrl-C", "code": "interrupted"}
