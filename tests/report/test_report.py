@@ -21,6 +21,7 @@ import equipix
 from equipix import detector, hardware, lens, metrics, nuc, plan, simulate
 from equipix.errors import FileError
 from equipix.pictures import new_figure
+from equipix.report import camera
 from equipix.report.drawing import (
     draw_convergence,
     draw_histogram,
@@ -527,6 +528,20 @@ class TestCamera:
         assert [each["verdict"] for each in found] == ["FAIL", "PASS"]
         limits.write_text("[camera]\ndark_noise_e = 1e3\n")
         assert run(*asked)[0] == 0
+
+    def test_is_judged_once(self, tmp_path, run, monkeypatch):
+        limits = tmp_path / "limits.toml"
+        limits.write_text("[camera]\ndark_noise_e = 1e3\n")
+        path, judged = written_camera(tmp_path, count=6, spatial=0), []
+
+        def counted(*arguments, judge=camera.checked):
+            judged.append(arguments)
+            return judge(*arguments)
+
+        monkeypatch.setattr(camera, "checked", counted)
+        asked = ("emva", path, "-o", tmp_path / "it.html", "--limits", limits, "--check")
+        assert run(*asked)[0] == 0
+        assert len(judged) == 1
 
     def test_planes_are_parts_and_columns(self, tmp_path, run):
         path, out = written_camera(tmp_path, cfa="RGGB", count=18, spatial=0), tmp_path / "it.html"
