@@ -19,6 +19,7 @@ from equipix.experiment.manifest import (
     CameraLight,
     CameraManifest,
     checked_content,
+    unreadable,
 )
 from equipix.findings import Finding, Rule, ask, say
 from equipix.io.paths import as_path
@@ -507,7 +508,7 @@ def _groups(path: Path) -> list[_Group]:
     try:
         lines = path.read_text(encoding="utf-8-sig", errors="surrogateescape").splitlines()
     except OSError as error:
-        raise FileError(f"{path}: cannot be read: {error.strerror}") from error
+        raise FileError(f"{path}: {unreadable(path, error)}") from error
     for number, line in enumerate(map(str.strip, lines), 1):
         kind, _, rest = line.partition(" ")
         if kind in _LINES:
