@@ -218,8 +218,8 @@ class CameraExperiment(Described[CameraManifest]):
         Notes
         -----
         The frames of a level are reduced to their mean and variance when they are read, so memory
-        does not grow with their number. Files of a sensor with filters are read once for each
-        plane.
+        does not grow with their number. They are read once for each plane of the colour filters.
+        Those of one level are read once more, to find colours that `cfa` does not name.
         """
         shape = self._shape()
         colours = Colours.of(self.manifest.sensor.cfa)
