@@ -17,6 +17,7 @@ from equipix import cli, errors, simulate
 from equipix.comparison import Check, _verdict
 from equipix.metrics.correctability import student_quantile
 from equipix.pictures import draw_comparison
+from equipix.report import page as report_page
 from equipix.report.figures import rows_of
 
 SHAPE = (96, 128)
@@ -499,7 +500,7 @@ def check_pairs(files, limits, run):
     assert [each["verdict"] for each in pair["limits"]][-2:] == ["FAIL", "PASS"]
 
 
-def test_a_page_and_words_have_the_verdict(tmp_path, run):
+def test_a_page_and_words_have_the_verdict(tmp_path, run, monkeypatch):
     files = [tmp_path / f"{name}.tif" for name in ("one", "other", "tilted", "plain")]
     calibrations = [measured(1, 4), measured(2, 5), measured(3, 5, lamp=3e-5)]
     calibrations.append(dataclasses.replace(calibrations[0], sensitivity_std=None, tilt_std=None))
@@ -508,9 +509,15 @@ def test_a_page_and_words_have_the_verdict(tmp_path, run):
     )
     for file, each in zip(files, calibrations, strict=True):
         each.save(file)
-    page = tmp_path / "page.html"
+    page, judged = tmp_path / "page.html", []
+
+    def counted(*arguments, judge=report_page.checked):
+        judged.append(arguments)
+        return judge(*arguments)
+
+    monkeypatch.setattr(report_page, "checked", counted)
     status, out, err = run("compare", *files[:3], "-o", page)
-    assert (status, err) == (0, "")
+    assert (status, err, len(judged)) == (0, "", 3)
     assert f"{files[0]} − {files[1]}: agree within their noise\n" in out
     assert re.search(r"other\.tif − .*tilted\.tif: differ by more .*: tilt along columns \d", out)
     assert re.search(

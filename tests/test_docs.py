@@ -18,6 +18,7 @@ import before_after
 import numpy as np
 import pytest
 import typer.main
+from astropy.io import fits
 
 import equipix
 import key_tables
@@ -83,7 +84,22 @@ def test_the_python_of_readme_and_pages_runs(tmp_path, monkeypatch):
     assert names["usable"].all()
 
 
+def write_night(folder: Path) -> None:
+    """Frames of two exposure times, and darks of two others, as the commands name them."""
+    folder.mkdir()
+    rng = np.random.default_rng(1)
+    for name, time, level in [
+        *((f"dark-{time}s-{k}", time, 100) for time in (1, 4) for k in (1, 2)),
+        *((f"m31-{time}s", time, 300) for time in (1, 2)),
+    ]:
+        frame = rng.poisson(level + 10 * time, (120, 160)).astype(np.uint16)
+        kind = "Dark Frame" if level == 100 else "Light Frame"
+        cards = {"EXPTIME": float(time), "CCD-TEMP": -10.0, "IMAGETYP": kind, "OBJECT": "M 31"}
+        fits.writeto(folder / f"{name}.fits", frame, fits.Header(cards))
+
+
 def test_the_commands_of_readme_and_pages_run(tmp_path):
+    write_night(tmp_path / "night")
     commands = [block for block in blocks("sh", *GUIDE) if block.startswith("equipix")]
     script = "\n".join(commands)
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
@@ -98,6 +114,13 @@ def test_the_commands_of_readme_and_pages_run(tmp_path):
     assert equipix.load(tmp_path / "cal.tif").converged
     assert len(list((tmp_path / "corrected").glob("*.tif"))) == 5
     assert (tmp_path / "plan.png").exists()
+    head = fits.getheader(tmp_path / "m31.fits")
+    assert (head["OBJECT"], head["BUNIT"], head["BITPIX"]) == ("M 31", "adu", -32)
+    assert head["EQUIPIX"].startswith("corrected by equipix, correction sha256 ")
+    text = re.search(r"^    (dark: .*)$", TEXTS["docs/correcting.md"], re.MULTILINE)
+    assert text is not None
+    lines = list(fits.getheader(tmp_path / "night/corrected/m31-2s.fits")["HISTORY"])
+    assert text[1] in lines
 
 
 def test_the_manifests_of_the_pages_are_valid():

@@ -304,6 +304,31 @@ def test_quality_holds_one_stack_of_corrected_frames(tmp_path, filters):
     assert peak < 3 * frames.nbytes
 
 
+def test_the_cost_of_words_holds_one_level(tmp_path):
+    """Beside its corrected frames: of another level not even half of the raw frames are held."""
+    shape = (150, 200)
+    equipix.nuc.fit(np.ones((2, *shape)) * [[[100.0]], [[900.0]]]).save(tmp_path / "r.npz")
+    names = []
+    for number in range(2):
+        frames = np.random.default_rng(number).normal(300 + 200 * number, 3, (24, *shape))
+        raw = np.rint(frames).astype(np.uint16)
+        names.append(str(tmp_path / f"level{number}.tif"))
+        write_frames(names[-1], raw, nbytes=raw.nbytes)
+
+    def peak(names):
+        command = ["hardware", str(tmp_path / "r.npz"), "-o", str(tmp_path / "t.bin"), "--force"]
+        tracemalloc.start()
+        try:
+            with pytest.raises(SystemExit, match="0"):
+                cli.main([*command, *(f"--frames={name}" for name in names)])
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    peak(names[:1])  # imports
+    assert peak(names) < peak(names[:1]) + raw.nbytes / 2
+
+
 @pytest.mark.parametrize("dark", [None, 5.0], ids=["no dark", "dark"])
 def test_coefficients_are_made_in_the_precision_of_the_frames(dark):
     """Of 4 bytes, beside one map or two of 8: all coefficients of 8 bytes took 8 maps of 4."""

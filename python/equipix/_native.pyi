@@ -19,6 +19,7 @@ __all__ = [
     "apply_words",
     "average_files",
     "common_fraction",
+    "exposure_s",
     "file_format",
     "fit_response",
     "locate_spots",
@@ -73,6 +74,7 @@ def average_files(
     workers: int | None,
     progress: _Progress | None,
 ) -> _Statistics: ...
+def exposure_s(path: str | PathLike[str]) -> float | None: ...
 def file_format(path: str | PathLike[str]) -> tuple[int, int, int, int]: ...
 def read_file(path: str | PathLike[str], workers: int | None) -> NDArray[Any]: ...
 

@@ -561,6 +561,10 @@ def test_files_that_cannot_be_read_say_what_to_do(run, experiment, calibration, 
         refused(result, f"{name}: ", words)
     result = run("calibrate", tmp_path, "-o", output)
     refused(result, f"{tmp_path}: is a folder, expected the file experiment.toml")
+    for command in (("calibrate",), ("nuc", "fit")):
+        result = run(*command, tmp_path / "no.toml", "-o", output)
+        refused(result, f"{tmp_path / 'no.toml'}: does not exist, expected the file ")
+    refused(run("emva", tmp_path / "EMVA.txt"), f"{tmp_path / 'EMVA.txt'}: does not exist")
     for name in ("nosuch.bin", "nosuch.h", "nosuch.npz", "nosuch.tif"):
         refused(run("inspect", tmp_path / name), f"{name}: does not exist")
 

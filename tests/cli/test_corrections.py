@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -256,6 +258,23 @@ class TestBolometer:
         ):
             status, _, err = run("correct", *given, "-o", no)
             assert (status, words in err, no.exists()) == (1, True, False), err
+
+    def test_the_commands_of_the_page_run(self, run, folder, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        page = (Path(__file__).parents[2] / "docs/infrared.md").read_text()
+        found = re.findall(r"```sh\n(equipix (?:bolometer|correct dynamic)(?:.|\n)*?)```", page)
+        assert len(found) == 2
+        for name in ("shutter", "cold", "hot"):
+            (tmp_path / name).mkdir()
+            for k, file in enumerate(sorted(folder.glob(f"{name}*.npy"))):
+                frame = np.load(file).astype(np.float32)
+                write_frames(tmp_path / name / f"{k}.tif", [frame], nbytes=1)
+        (tmp_path / "raw").mkdir()
+        write_frames(tmp_path / "raw/a.tif", [frame], nbytes=1)
+        for line in found:
+            status, _, err = run(*shlex.split(line.replace("\\\n", ""))[1:])
+            assert status == 0, err
+        assert "substrate_c 21.7, bias_v 2" in header(tmp_path / "corrected/a.tif").description
 
     def test_asks_for_the_bias_where_several_were_calibrated(self, run, folder, tmp_path):
         out, volts = tmp_path / "dynamic.npz", "1.8 2 2 2 2.2"

@@ -106,22 +106,32 @@ class TestJson:
         def exhausted(*_, **__):
             raise MemoryError
 
-        monkeypatch.setattr("equipix.measured.average.find_files", exhausted)
+        monkeypatch.setattr("equipix.measured.average.frame_files", exhausted)
         status, _, err = run("average", frames, "-o", tmp_path / "a.npz", "--json")
         assert status == 1
         assert json.loads(err)["code"] == "memory"
 
     def test_it_may_stand_anywhere_on_the_line(self, run):
-        for given in (("--json", "inspect", "none.tif"), ("nuc", "--json")):
+        wanted = 1, "", '{"error": "none.tif: does not exist", "code": "file"}\n'
+        for given in (("--json", "inspect"), ("inspect", "--json"), ("-v", "--json", "inspect")):
+            assert run(*given, "none.tif") == wanted
+        status, _, err = run("nuc", "--json", "fit", "none.toml", "-o", "o.tif")
+        assert (status, json.loads(err)["code"]) == (1, "file")
+        for given in (("nuc", "--json"), ("--json",)):
             status, out, err = run(*given)
             assert (status, out, json.loads(err)["code"]) == (2, "", "usage")
+
+    def test_behind_two_dashes_it_is_a_name(self, run):
+        status, out, err = run("inspect", "--", "--json")
+        assert (status, out, err.split("ends")[0]) == (1, "", "equipix: error: --json: ")
+        assert json.loads(run("--json", "inspect", "--", "--json")[2])["code"] == "input"
 
     @pytest.mark.parametrize("given", [("--json",), ()])
     def test_ctrl_c_has_a_code(self, run, frames, tmp_path, monkeypatch, given):
         def stopped(*_, **__):
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("equipix.measured.average.find_files", stopped)
+        monkeypatch.setattr("equipix.measured.average.frame_files", stopped)
         status, out, err = run("average", frames, "-o", tmp_path / "a.npz", *given)
         assert (status, out) == (130, "")
         told = {"error": "stopped by Ctrl-C", "code": "interrupted"}

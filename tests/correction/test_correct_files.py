@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -121,9 +123,31 @@ class TestDarks:
             correct_files(response, ["m31-20.fits"], night / "out", dark=dark)
         assert sorted(night.iterdir()) == before
 
-    def test_the_stored_one_and_words_are_not_mixed_with_files(self, response, night):
-        with pytest.raises(InputError, match="'none' and names files too"):
-            correct_files(response, ["m31-5.fits"], night / "o", dark=["none", "master5.fits"])
+    @pytest.mark.parametrize(
+        ("dark", "words"),
+        [
+            (["none", "master5.fits"], "is 'none' and names files too: leave out one"),
+            (["master5.fits", "stored"], "is 'stored' and names files too: leave out one"),
+            (["none", "none"], "is 'none' twice: give it once"),
+            (["stored", "stored"], "is 'stored' twice: give it once"),
+        ],
+    )
+    def test_a_word_stands_alone(self, response, night, dark, words):
+        with pytest.raises(InputError, match=rf"'dark' \(--dark\) {words}$"):
+            correct_files(response, ["m31-5.fits"], night / "o", dark=dark)
+
+    @pytest.mark.parametrize("keyword", ["IMAGETYP", "OBSTYPE", "FRAME"])
+    def test_a_frame_of_light_is_named_with_its_keyword(self, response, night, keyword):
+        written("sky.fits", 5, LIGHT, **{"IMAGETYP": None, keyword: "FLAT"})
+        words = rf"sky.fits: is 'FLAT' by its header \({keyword}\), expected dark frames"
+        with pytest.raises(FileError, match=words):
+            correct_files(response, ["m31-5.fits"], night / "o", dark=["s*.fits"])
+
+    def test_a_dark_that_is_subtracted_is_named_by_its_file(self, response, night):
+        dark = equipix.load("master1.fits")
+        equipix.average("dark5-*.fits", dark=dark).save("less.fits")
+        with pytest.raises(InputError, match=r"^less.fits: its dark was already subtracted"):
+            correct_files(response, ["m31-5.fits"], night / "o", dark=["le*.fits"])
 
     @pytest.mark.parametrize(
         ("dark", "named"),
@@ -157,7 +181,54 @@ class TestDarks:
         assert found.message.startswith(f"dark5-1.{suffix} and 1 more: given as frames, but")
 
 
+@pytest.fixture
+def opened(monkeypatch):
+    """Names of FITS files with how often each was opened."""
+    counts = Counter()
+
+    def counted(path, *arguments, opening=fits.open, **options):
+        counts[Path(getattr(path, "name", path)).name] += 1
+        return opening(path, *arguments, **options)
+
+    monkeypatch.setattr(fits, "open", counted)
+    return counts
+
+
+@pytest.mark.usefixtures("night")
+class TestOpens:
+    """A file is opened once for all that its header holds, and once for its frames."""
+
+    def test_of_an_average(self, run, opened):
+        darks = ["dark5-0.fits", "dark5-1.fits"]
+        options = [f"--dark={name}" for name in darks]
+        assert run("average", "m31-5.fits", "dark5-2.fits", "-o", "a.npz", *options)[0] == 0
+        assert opened == dict.fromkeys(["m31-5.fits", "dark5-2.fits", *darks], 2)
+
+    def test_of_a_saved_average(self, run, opened):
+        assert run("average", "master5.fits", "-o", "a.npz", "--dark", "master1.fits")[0] == 0
+        # The second time its checksums are compared.
+        assert opened == {"master5.fits": 2, "master1.fits": 2}
+
+    @pytest.mark.parametrize("dark", [["dark5-0.fits"], ["master5.fits", "dark10-0.fits"]])
+    def test_of_corrected_frames(self, response, night, opened, dark):
+        source = ["m31-5.fits", "m31-7.fits"] if len(dark) > 1 else ["m31-5.fits"]
+        correct_files(response, source, night / "out.tif", dark=dark)
+        assert opened == dict.fromkeys([*source, *dark], 2)
+        opened.clear()
+        correct_files(response, source, night / "out.fits", dark=dark)
+        # Once more for the header that is kept.
+        assert opened == dict.fromkeys(source, 3) | dict.fromkeys(dark, 2)
+
+
 class TestFits:
+    @pytest.mark.parametrize("name", ["picture.fits", "picture.FIT"])
+    def test_it_holds_no_picture(self, response, night, name):
+        """Whose values are in no unit, beside a header that names one."""
+        words = rf"'display' .*{name}' holds values .* in a unit: name a .tif, a .png"
+        with pytest.raises(InputError, match=words):
+            correct_files(response, ["m31-5.fits"], night / name, display="linear")
+        assert not (night / name).exists()
+
     def test_headers_are_kept_and_say_what_was_done(self, response, night):
         darks = ["master5.fits", "master10.fits"]
         origin = "correction sha256 " + 64 * "a"
@@ -175,7 +246,12 @@ class TestFits:
             assert ccd.header[key] == value
         assert "BZERO" not in ccd.header
         history = "".join(ccd.header["HISTORY"])
-        for words in ("observed", origin, "0.6 master5.fits + 0.4 master10.fits", "1 flagged"):
+        for words in (
+            "observed",
+            origin,
+            "0.6 of master5.fits + 0.4 of master10.fits",
+            "1 flagged",
+        ):
             assert words in history
         with pytest.warns(InputWarning, match="corrected already, by this correction"):
             correct_files(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+
 import numpy as np
 import pytest
 import tifffile
@@ -10,9 +12,10 @@ from astropy.io import fits
 import equipix
 from equipix import Experiment, LevelExperiment, errors, metrics, simulate
 from equipix.comparison import _waves
+from equipix.io.formats import FrameFile
 from equipix.io.frames import Settings, apart, settings
-from equipix.measured.darks import mixed, settings_in, settings_of
 from equipix.measured.means import Averaged
+from equipix.measured.settings import mixed, settings_in, settings_of
 from given import write_dng
 
 SHAPE = (64, 80)
@@ -141,8 +144,8 @@ def test_one_between_two_is_interpolated_with_its_variance(manifest):
     np.testing.assert_allclose(cal.weighted.exposures.values[2], wanted, rtol=1e-6, atol=1e-3)
     assert cal.metadata["darks"][::2] == [
         "[[dark]] 2 (1 s)",
-        "0.667 × [[dark]] 2 (1 s) + 0.333 × [[dark]] 3 (4 s)",
-        "0.333 × [[dark]] 2 (1 s) + 0.667 × [[dark]] 3 (4 s)",
+        "0.6667 of [[dark]] 2 (1 s) + 0.3333 of [[dark]] 3 (4 s)",
+        "0.3333 of [[dark]] 2 (1 s) + 0.6667 of [[dark]] 3 (4 s)",
     ]
     found = mixed([low, high], (2 / 3, 1 / 3))
     np.testing.assert_allclose(
@@ -327,7 +330,7 @@ def test_averages_and_results_keep_what_their_darks_were_taken_with(tmp_path, ca
     path = fits_levels(tmp_path, camera, dark_times=(1.0,))
     average = equipix.average(tmp_path / "dark1.fits", saturation=65535)
     average.save(tmp_path / "master.tif")
-    assert settings_of(tmp_path / "master.tif") == Settings(1.0, -9.95)
+    assert settings_of(FrameFile(tmp_path / "master.tif")) == Settings(1.0, -9.95)
     assert settings_in(mixed([average] * 2, (0.5, 0.5)).metadata) == Settings(1.0, -9.95)
     path.write_text(path.read_text().replace("dark1.fits", "master.tif"))
     with pytest.warns(errors.InputWarning, match="dark. was taken with the exposure time 1 s"):
@@ -450,11 +453,61 @@ def test_exif_and_tags_give_the_exposure_time(tmp_path):
     assert settings(tmp_path / "d.npy") == Settings()
 
 
+def write_exif(path, order, time, *, big=False):
+    """Write a TIFF with an EXIF directory behind its frame, in the byte order "<" or ">"."""
+    offset, count, entry = ("Q", "Q", "HHQ") if big else ("I", "H", "HHI")
+    tifffile.imwrite(
+        path,
+        np.arange(72, dtype=np.uint16).reshape(8, 9),
+        byteorder=order,
+        bigtiff=big,
+        photometric="minisblack",
+        metadata=None,
+        extratags=[(65000, offset, 1, 0, True)],
+    )
+    with tifffile.TiffFile(path) as file:
+        tag = file.pages[0].tags[65000]
+    content = bytearray(path.read_bytes())
+    start = len(content)
+    struct.pack_into(f"{order}H", content, tag.offset, 34665)  # which tifffile does not write
+    struct.pack_into(f"{order}{offset}", content, tag.valueoffset, start)
+    head = struct.pack(f"{order}{count}{entry}", 1, 33434, 5, 1)
+    ratio, last = struct.pack(f"{order}2I", *time), struct.pack(f"{order}{offset}", 0)
+    if big:  # a ratio fits into its entry
+        path.write_bytes(content + head + ratio + last)
+    else:
+        behind = struct.pack(f"{order}I", start + len(head) + 4 + len(last))
+        path.write_bytes(content + head + behind + last + ratio)
+    return path
+
+
+@pytest.mark.parametrize("order", "<>")
+def test_the_compiled_reader_finds_exif(tmp_path, order, monkeypatch):
+    one, other, third = (
+        write_exif(tmp_path / f"{k}.tif", order, time)
+        for k, time in enumerate([(1, 60), (3, 0), (1, 30)])
+    )
+    big = write_exif(tmp_path / "big.tif", order, (1, 60), big=True)
+    assert settings(big) == Settings(1 / 60)  # by tifffile
+    monkeypatch.setattr(tifffile, "TiffFile", None)
+    assert [settings(each) for each in (one, other)] == [Settings(1 / 60), Settings()]
+    assert equipix.average([one, other]).metadata["exposure_s"] == 1 / 60
+    with pytest.raises(errors.FileError, match=r"'.*0.tif' holds the exposure time 0.0166667 s"):
+        equipix.average([one, third])
+
+
+def test_a_broken_exif_is_named(tmp_path):
+    path = write_exif(tmp_path / "a.tif", "<", (1, 60))
+    path.write_bytes(path.read_bytes()[:-30])
+    with pytest.raises(errors.FileError, match=r"a.tif: (is broken|cannot be read): "):
+        settings(path)
+
+
 def test_a_stack_of_another_program_is_no_saved_average(tmp_path):
     """It may hold JSON of its own, as tifffile writes the shape."""
     stack = np.ones((3, 16, 20), np.float32)
     tifffile.imwrite(tmp_path / "stack.tif", stack, photometric="minisblack")
-    assert settings_of(tmp_path / "stack.tif") == Settings()
+    assert settings_of(FrameFile(tmp_path / "stack.tif")) == Settings()
 
 
 @pytest.mark.filterwarnings("ignore::equipix.errors.InputWarning")

@@ -805,6 +805,25 @@ def test_the_worst_of_several_levels_counts_and_is_named(made, tmp_path, run):
     assert "one.tif: holds one frame, expected two or more: each --frames names all of a" in said
 
 
+def test_the_frames_of_a_level_are_corrected_once(made, tmp_path, run, monkeypatch):
+    array, response = made
+    response.save(tmp_path / "response.npz")
+    names = []
+    for light in (3e6, 8.5e6):
+        names.append(tmp_path / f"{light:g}.tif")
+        write_frames(names[-1], np.stack(list(array.frames(light, 4, rng=3))), nbytes=1)
+    corrected, correct = [], nuc.Response.correct
+
+    def counted(self, frames, **options):
+        corrected.append(len(frames))
+        return correct(self, frames, **options)
+
+    monkeypatch.setattr(nuc.Response, "correct", counted)
+    command = ["hardware", tmp_path / "response.npz", "-o", tmp_path / "table.bin"]
+    assert run(*command, *(f"--frames={name}" for name in names))[0] == 0
+    assert corrected == [4, 4]
+
+
 def test_the_smallest_width_is_the_first_that_suffices():
     array, response = docs.two_point()
     found = hardware.smallest_widths(response, docs.frames_of(array), lowest=docs.LOWEST)

@@ -95,7 +95,7 @@ def test_frames_come_back(tmp_path, write, dtype):
     read = read_frames(path)
     np.testing.assert_array_equal(read, frames)
     assert read.dtype == np.dtype(dtype).newbyteorder("=")
-    shape, kind, _ = header(equipix.io.paths.as_path("frames", path))
+    shape, kind, *_ = header(equipix.io.paths.as_path("frames", path))
     assert (shape, kind) == (frames.shape, read.dtype)
 
 

@@ -21,6 +21,7 @@ import equipix
 from equipix import detector, hardware, lens, metrics, nuc, plan, simulate
 from equipix.errors import FileError
 from equipix.pictures import new_figure
+from equipix.report import camera
 from equipix.report.drawing import (
     draw_convergence,
     draw_histogram,
@@ -569,6 +570,20 @@ class TestCamera:
         assert "prnu_percent is not measured (add [spatial]), expected at most 1e+09" in told
         assert "dark current by the mean" in printed
         assert "dark_noise_e" not in told
+
+    def test_is_judged_once(self, tmp_path, run, monkeypatch):
+        limits = tmp_path / "limits.toml"
+        limits.write_text("[camera]\ndark_noise_e = 1e3\n")
+        path, judged = written_camera(tmp_path, count=6, spatial=0), []
+
+        def counted(*arguments, judge=camera.checked):
+            judged.append(arguments)
+            return judge(*arguments)
+
+        monkeypatch.setattr(camera, "checked", counted)
+        asked = ("emva", path, "-o", tmp_path / "it.html", "--limits", limits, "--check")
+        assert run(*asked)[0] == 0
+        assert len(judged) == 1
 
     def test_planes_are_parts_and_columns(self, tmp_path, run):
         path, out = written_camera(tmp_path, cfa="RGGB", count=18, spatial=0), tmp_path / "it.html"

@@ -91,7 +91,10 @@ _USAGE: Any = typer.BadParameter.__base__
 def run(given: list[str]) -> None:
     """Run the command line, errors and warnings as one line each, with --json an error as JSON."""
     CALLED.set(None)
-    as_json = "--json" in given
+    options, names = _parted(given)
+    as_json = "--json" in options
+    if as_json:  # It may stand anywhere: typer takes it behind the name of a command alone.
+        given = [*(each for each in options if each != "--json"), "--json", *names]
     with warnings.catch_warnings():
         warnings.simplefilter("always", EquipixWarning)
         warnings.showwarning = show_warning
@@ -113,6 +116,12 @@ def run(given: list[str]) -> None:
     if status == _INTERRUPTED:
         raise KeyboardInterrupt
     raise SystemExit(status or 0)
+
+
+def _parted(given: list[str]) -> tuple[list[str], list[str]]:
+    """Part a line before "--", behind which are names."""
+    end = given.index("--") if "--" in given else len(given)
+    return given[:end], given[end:]
 
 
 _INTERRUPTED = 130

@@ -125,19 +125,19 @@ def compare(
     _refuse_equal(calibrations, loaded)
     result = compare_calibrations(loaded)
     names = [str(file) for file in calibrations]
-    if output is not None and is_page:
-        parts = comparison_parts(result, calibrations, loaded, wanted)
-        text = page(parts, "Calibrations compared")
-        write_page(output, text, force=force)
-    elif output is not None:
-        stems = [file.stem for file in calibrations]
-        save_figure(draw_comparison(result, stems), output, force=force)
     judged = {
         f"{names[i]} − {names[j]}": comparison_checks(
             result, k, loaded[i].findings + loaded[j].findings, wanted
         )
         for k, (i, j) in enumerate(result.pairs)
     }
+    if output is not None and is_page:
+        parts = comparison_parts(result, calibrations, loaded, judged)
+        text = page(parts, "Calibrations compared")
+        write_page(output, text, force=force)
+    elif output is not None:
+        stems = [file.stem for file in calibrations]
+        save_figure(draw_comparison(result, stems), output, force=force)
     predicted = None if result.predicted_rms is None else result.predicted_rms.tolist()
     pairs: list[dict[str, Any]] = [
         {

@@ -35,14 +35,14 @@ def emva(
     refuse_inputs(terminal.given(output), [loaded.path, *loaded.files()])
     with terminal.working() as (progress, _):
         planes = loaded.figures(workers=workers, progress=progress)
-    if output is not None:
-        name = loaded.path.parent.resolve().name
-        text = page(camera_parts(name, planes, wanted), "Figures of a camera")
-        write_page(output, text, force=force)
     judged = {
         f"plane {name}" if name else str(camera): camera_checks(found, wanted)
         for name, found in planes.items()
     }
+    if output is not None:
+        name = loaded.path.parent.resolve().name
+        text = page(camera_parts(name, planes, judged.values()), "Figures of a camera")
+        write_page(output, text, force=force)
     if as_json:
         of_planes = {
             name: {each.key: each.value for each in figures_of(found)}

@@ -11,11 +11,11 @@ from equipix.correction.correct_files import correct_files, is_folder
 from equipix.errors import InputError
 from equipix.experiment.image_files import origin_of, refuse_repeated_files, with_inputs
 from equipix.findings import ask, say
-from equipix.io.formats import SAVED, SUFFIXES
-from equipix.io.paths import find_files, refuse_inputs
+from equipix.io.formats import SAVED, SUFFIXES, frame_files
+from equipix.io.paths import refuse_inputs
 from equipix.measured import statistics
 from equipix.measured.average import average as average_frames
-from equipix.measured.darks import average_findings
+from equipix.measured.settings import average_findings
 from equipix.report.figures import known
 from equipix.saved_results import READ, load_correction
 
@@ -53,17 +53,18 @@ def averaged(
     frames: list[str], dark: list[str] | None, output: Path, mask: Path | None, **options: Any
 ) -> statistics.FrameStatistics:
     """Average frames, less their dark, with findings and the hashes of the files."""
-    images, offsets = find_files(frames), find_files(dark) if dark else []
-    refuse_inputs([output], [*images, *offsets, *terminal.given(mask)])
-    hashes = refuse_repeated_files(images, offsets)
+    images, offsets = frame_files(frames), frame_files(dark) if dark else []
+    paths, of_darks = ([each.path for each in files] for files in (images, offsets))
+    refuse_inputs([output], [*paths, *of_darks, *terminal.given(mask)])
+    hashes = refuse_repeated_files(paths, of_darks)
     with terminal.working(mask) as (progress, excluded):
         offset = None
-        if dark:
-            is_saved = any(statistics.saved_shape(file) for file in offsets)
+        if offsets:
+            is_saved = any(map(statistics.is_average, offsets))
             of_dark = options | ({"reject": None} if is_saved else {})
-            offset = average_frames(dark, progress=progress, **of_dark)
-            statistics.refuse_subtracted(offset, " ".join(dark))
-        found = average_frames(frames, dark=offset, mask=excluded, progress=progress, **options)
+            offset = average_frames(offsets, progress=progress, **of_dark)
+            statistics.refuse_subtracted(offset, str(of_darks[0]))
+        found = average_frames(images, dark=offset, mask=excluded, progress=progress, **options)
     said = say(*average_findings(images, offsets), *ask(statistics.AVERAGED, found))
     return replace(found, findings=said, metadata=with_inputs(found.metadata, hashes))
 
@@ -79,8 +80,8 @@ def averaged(
     dtype="Type of the result: whole numbers are rounded half to even, and values that had to be "
     "limited are counted. float32 unless given; uint16 for a .png.",
     bit_depth="Significant bits of whole numbers, 8 to 16.",
-    display="8-bit pictures: 'linear' between the percentiles 0.5 and 99.5 of each frame, or by "
-    "its 'histogram' with a plateau of 4 times the mean of its bins.",
+    display="8-bit pictures, in no .fits: 'linear' between the percentiles 0.5 and 99.5 of each "
+    "frame, or by its 'histogram' with a plateau of 4 times the mean of its bins.",
 )
 def correct(
     correction: Annotated[Path, typer.Argument(help=f"A correction: {READ}.")],

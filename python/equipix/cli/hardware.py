@@ -5,19 +5,16 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from equipix._check import Array, naming_memory
+from equipix._check import naming_memory
 from equipix.cli import terminal
 from equipix.correction.protocol import Correction, check_sensor
 from equipix.errors import InputError
 from equipix.findings import Findings
-from equipix.hardware.quality import Cost, quality, smallest_widths
+from equipix.hardware.quality import Cost, Trial, trial, widths_of
 from equipix.hardware.table import IMAGES, SUFFIXES, UPLOAD, Table
 from equipix.hardware.words import WIDEST
 from equipix.report.figures import summary
 from equipix.saved_results import READ, load_correction
-
-_SOUGHT = ("offset_bits", "gain_bits")
-"""Widths of which the smallest that suffice are sought."""
 
 _OF_GAINS = ("output", "shape", "bits", "steps", "unusable_pixels", "correction_sha256")
 """Figures of a file of gains alone."""
@@ -129,14 +126,11 @@ def _cost(
 ) -> tuple[dict[str, Any], Findings]:
     """Measure C of frames of each level by correction and table, and the widths that suffice."""
     with naming_memory("measuring quality"):
-        read = [_level(pattern) for pattern in frames]
-        found = [quality(correction, raw, **options) for raw, _ in read]
-        others = {name: value for name, value in options.items() if name not in _SOUGHT}
-        widths = smallest_widths(correction, [raw for raw, _ in read], **others)
-
+        tried, said = zip(*(_tried(correction, each, options) for each in frames), strict=True)
+    widths = widths_of([level.by_width for level in tried])
     costs = {
         (number, plane): cost
-        for number, level in enumerate(found)
+        for number, level in enumerate(tried)
         for plane, cost in level.planes.items()
     }
     worst = max(costs, key=lambda place: costs[place].added)
@@ -146,7 +140,7 @@ def _cost(
     }
     figures = {
         **_cost_figures(costs[worst]),
-        "words_at_ends_of_adc": sum(level.at_ends for level in found),
+        "words_at_ends_of_adc": sum(level.at_ends for level in tried),
         "sufficient_bits": {each: getattr(widths, f"{each}_bits") for each in widths.worst},
     }
     if len(costs) > 1:
@@ -157,20 +151,20 @@ def _cost(
             ],
             "costs": [named[place] | _cost_figures(cost) for place, cost in costs.items()],
         }
-    said = [each for _, more in read for each in more]
-    said += [each for cost in costs.values() for each in cost.before.findings]
-    return figures, tuple(said)
+    found = [each for more in said for each in more]
+    found += [each for cost in costs.values() for each in cost.before.findings]
+    return figures, tuple(found)
 
 
-def _level(pattern: str) -> tuple[Array, Findings]:
-    """Read the frames of one level."""
+def _tried(correction: Correction, pattern: str, options: dict[str, Any]) -> tuple[Trial, Findings]:
+    """Measure the cost at one level, whose frames are read and left again."""
     raw, said = terminal.raw_frames([pattern])
     if len(raw) < 2:
         raise InputError(
             f"{pattern}: holds one frame, expected two or more: each 'frames' names all of a "
             'level, as "level/*.tif" does'
         )
-    return raw, said
+    return trial(correction, raw, **options), said
 
 
 def _cost_figures(cost: Cost) -> dict[str, float]:

@@ -117,7 +117,7 @@ def _method(
     name: str, frames: list[str], options: dict[str, Any], resume: Path | None, workers: int | None
 ) -> SceneCorrection:
     """Make the correction, or read its state."""
-    (_, rows, cols), dtype, _ = raw_header(find_files(frames)[0])
+    (_, rows, cols), dtype, *_ = raw_header(find_files(frames)[0])
     shape = (rows, cols)
     if resume is not None:
         if options:

@@ -1,23 +1,24 @@
 """Frames in files corrected, and pictures of them."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from equipix._check import LOG, Array, Display, Flagged, OutputType, Progress
 from equipix.correction.apply import FAST, Corrector, output_dtype, usual_treatment
-from equipix.correction.darks import (
+from equipix.correction.file_darks import (
     FileDarks,
     file_darks,
     is_as_dark,
     warn_of_as_dark,
     warn_of_darker,
 )
-from equipix.correction.protocol import Correction, Dark
+from equipix.correction.protocol import Correction
 from equipix.errors import FileError, InputError
 from equipix.findings import Finding, Findings, say, usable
 from equipix.io import fits
@@ -90,7 +91,7 @@ def correct_files(
     output : Path
         A name that ends in .tif or .fits: one file of all frames; in .png: the only frame, as whole
         numbers. Another: a folder to make, with a FITS file for each FITS file, pictures apart, and
-        a TIFF for each other. FITS files keep the headers of FITS files.
+        a TIFF for each other. FITS files keep the headers of FITS files, and are no pictures.
     dark : list of str, optional
         "stored", which it is unless given, "none", or for each exposure time a file or glob of dark
         frames, or of their saved statistics. Of several each file takes the one that fits by its
@@ -129,7 +130,7 @@ def correct_files(
         light by its header, or none of several darks fits a file.
     InputError
         If the frames have another shape than the correction, it takes no other dark frame, or more
-        than one frame would go to a .png, or floating-point numbers.
+        than one frame would go to a .png, or floating-point numbers, or pictures to a .fits.
 
     Warns
     -----
@@ -144,55 +145,24 @@ def correct_files(
     """
     wanted = _dtype(output, dtype, bit_depth, display)
     files = find_files(source)
-    refuse_inputs(files, [], "is named twice: name each input once")
     outputs = _outputs(output, files, display)
-    refuse_inputs(outputs, files)
     headers = raw_headers(files, correction.shape)
-    total, done = sum(header.shape[0] for header in headers.values()), 0
+    total = sum(header.shape[0] for header in headers.values())
     _refuse_pictures(output, total, wanted)
     said = warn_of_corrected(headers, origin)
+    darks = file_darks(correction, dark, headers)
     flagged = usual_treatment(wanted) if flagged is None else flagged
-    darks = file_darks(correction, dark, files)
     LOG.info("corrects %d frames to %s, flagged pixels: %s", total, wanted, flagged)
-
-    def prepared(dark: Dark) -> Corrector:
-        return Corrector(
-            correction,
-            "float32" if display else wanted,
-            bit_depth=bit_depth,
-            flagged=flagged,
-            dark=dark,
-            sensor=sensor,
-            workers=workers,
-        )
-
-    on = _Correcting(correction.dark, darks, prepared, files[0])
-
-    def corrected(inputs: list[Path]) -> Iterator[NDArray[Any]]:
-        nonlocal done
-        for file, frames in stream_frames(inputs):
-            for frame in on.corrected(file, frames):
-                yield picture(frame, display) if display else frame
-            done += len(frames)
-            if progress is not None:
-                progress(done, total, "correcting")
-
-    def write(path: Path, inputs: list[Path]) -> None:
-        shapes = {file: headers[file].shape for file in inputs}
-        _write(path, corrected(inputs), shapes, dtype=wanted, mark=mark, history=history)
-
-    def history(file: Path) -> list[str]:
-        return [f"dark: {darks.named(file)}", f"{bad} flagged pixels: {flagged}"]
-
+    options: dict[str, Any] = {"bit_depth": bit_depth, "flagged": flagged, "sensor": sensor}
+    kind = "float32" if display else wanted
+    prepared = partial(Corrector, correction, kind, workers=workers, **options)
+    work = _Correcting(correction.dark, darks, prepared, files[0])
+    frames = partial(_frames, work, display, total, progress)
     bad = int(np.count_nonzero(~usable(correction.flags)))
-    mark = ", ".join(filter(None, (_MARK, origin)))
-    if not is_folder(output):
-        with write_whole(output, force=force) as temporary:
-            write(temporary, files)
-    else:
-        _fill(output, dict(zip(outputs, files, strict=True)), write)
-    said += darks.findings + on.findings + warn_of_as_dark(on.as_dark, darks.names[0])
-    made = on.corrector
+    beside = _Beside.of(headers, darks, origin, f"{bad} flagged pixels: {flagged}")
+    _write_all(output, outputs, frames, wanted, beside, force=force)
+    said += darks.findings + work.findings + warn_of_as_dark(work.as_dark, darks.names[0])
+    made = work.corrector
     said += _warn_of_limited(made.clipped, total * correction.flags.size, wanted)
     counts = made.clipped, made.extrapolated, made.replaced, bad if flagged == "nan" else 0
     return Corrected(wanted.name, total, *counts, said)
@@ -205,20 +175,22 @@ class _Correcting:
         self,
         stored: Array | None,
         darks: FileDarks,
-        prepared: Callable[[Dark], Corrector],
+        prepared: Callable[..., Corrector],
         first: Path,
     ) -> None:
         self._stored, self._darks, self._prepared = stored, darks, prepared
         self._file: Path | None = None
         self._shares, self._dark = darks.shares[first], darks.of(first)
-        self.corrector = prepared(self._dark)
+        self.corrector = prepared(dark=self._dark)
         self.findings: Findings = ()
         self.as_dark: list[Path] = []
+        self.done = 0
 
     def corrected(self, file: Path, frames: Array) -> Array:
         """Correct some frames of a file."""
         if file != self._file:
             self._go_on(file, frames[0])
+        self.done += len(frames)
         native = frames.dtype.newbyteorder("=")
         return self.corrector.apply(
             frames.astype(native if native in FAST else np.float32, copy=False)
@@ -226,12 +198,8 @@ class _Correcting:
 
     def _go_on(self, file: Path, frame: Array) -> None:
         """Take the dark of the next file, whose first frame is compared with it."""
-        shares = self._darks.shares[file]
-        if shares != self._shares:
-            last = self.corrector
-            self._shares, self._dark = shares, self._darks.of(file)
-            self.corrector = self._prepared(self._dark)
-            self.corrector.clipped, self.corrector.extrapolated = last.clipped, last.extrapolated
+        if self._darks.shares[file] != self._shares:
+            self._take_dark(file)
         dark = self._stored if isinstance(self._dark, str) else self._dark
         if dark is not None:
             if self._file is None:
@@ -240,15 +208,83 @@ class _Correcting:
                 self.as_dark.append(file)
         self._file = file
 
+    def _take_dark(self, file: Path) -> None:
+        """Make the corrector anew, which counts on."""
+        last = self.corrector
+        self._shares, self._dark = self._darks.shares[file], self._darks.of(file)
+        self.corrector = self._prepared(dark=self._dark)
+        self.corrector.clipped, self.corrector.extrapolated = last.clipped, last.extrapolated
 
-def _fill(output: Path, files: Mapping[Path, Path], write: Callable[..., None]) -> None:
-    """Write a file for each input into a folder, all or none."""
+
+def _frames(
+    work: _Correcting,
+    display: Display | None,
+    total: int,
+    progress: Progress | None,
+    files: Iterable[Path],
+) -> Iterator[NDArray[Any]]:
+    """Give the corrected frames of some files, or pictures of them."""
+    for file, frames in stream_frames(files):
+        for frame in work.corrected(file, frames):
+            yield picture(frame, display) if display else frame
+        if progress is not None:
+            progress(work.done, total, "correcting")
+
+
+class _Beside(NamedTuple):
+    """What stands beside frames: the text of each file, shapes of its inputs, their history."""
+
+    mark: str
+    shapes: Mapping[Path, tuple[int, int, int]]
+    history: Mapping[Path, tuple[str, ...]]
+
+    @classmethod
+    def of(cls, headers: Mapping[Path, Header], darks: FileDarks, origin: str, told: str) -> Self:
+        """Name the correction, the dark of each file, and what became of flagged pixels."""
+        mark = ", ".join(filter(None, (_MARK, origin)))
+        shapes = {file: header.shape for file, header in headers.items()}
+        return cls(mark, shapes, {file: (f"dark: {darks.named(file)}", told) for file in headers})
+
+
+def _write_all(
+    output: Path,
+    outputs: Mapping[Path, list[Path]],
+    frames: Callable[[list[Path]], Iterator[NDArray[Any]]],
+    dtype: np.dtype[Any],
+    beside: _Beside,
+    *,
+    force: bool,
+) -> None:
+    """Write one file, or a folder with a file for each input: all or none."""
+    if not is_folder(output):
+        with write_whole(output, force=force) as temporary:
+            _write(temporary, frames(outputs[output]), outputs[output], dtype, beside)
+        return
     with folder_beside(output) as folder:
-        for path, file in files.items():
-            write(folder / path.name, [file])
+        for path, files in outputs.items():
+            _write(folder / path.name, frames(files), files, dtype, beside)
         output.mkdir(exist_ok=True)
-        for path in files:
+        for path in outputs:
             (folder / path.name).replace(path)
+
+
+def _write(
+    path: Path,
+    frames: Iterator[NDArray[Any]],
+    files: list[Path],
+    dtype: np.dtype[Any],
+    beside: _Beside,
+) -> None:
+    """Write the frames of some files to a FITS file or a TIFF, or the only one to a PNG."""
+    if is_picture(path):
+        for frame in frames:
+            write_png(path, frame, description=beside.mark)
+    elif path.suffix.lower() in fits.SUFFIXES:
+        sources = [(file, beside.shapes[file], beside.history[file]) for file in files]
+        fits.write_frames(path, frames, sources, dtype=dtype, mark=beside.mark)
+    else:
+        nbytes = dtype.itemsize * sum(math.prod(beside.shapes[file]) for file in files)
+        write_frames(path, frames, nbytes=nbytes, description=beside.mark)
 
 
 def _dtype(
@@ -257,6 +293,11 @@ def _dtype(
     """Type of the output, by its name unless it is given."""
     if display is None:
         return output_dtype(dtype or ("uint16" if is_picture(output) else "float32"))
+    if output.suffix.lower() in fits.SUFFIXES:
+        raise InputError(
+            f"'display' makes pictures, but '{output}' holds values to measure, in a unit: name a "
+            ".tif, a .png of one frame or a folder, or leave out 'display'"
+        )
     if dtype not in (None, "uint8"):
         raise InputError(
             f"'display' makes pictures of 8 bits, but 'dtype' (--dtype) is '{dtype}': leave out one"
@@ -267,27 +308,6 @@ def _dtype(
             f"{bit_depth}: leave out one"
         )
     return np.dtype(np.uint8)
-
-
-def _write(
-    path: Path,
-    frames: Iterator[NDArray[Any]],
-    shapes: Mapping[Path, tuple[int, int, int]],
-    *,
-    dtype: np.dtype[Any],
-    mark: str,
-    history: Callable[[Path], list[str]],
-) -> None:
-    """Write the frames of some files to a FITS file or a TIFF, or the only one to a PNG."""
-    if is_picture(path):
-        for frame in frames:
-            write_png(path, frame, description=mark)
-    elif path.suffix.lower() in fits.SUFFIXES:
-        sources = [(file, shape, history(file)) for file, shape in shapes.items()]
-        fits.write_frames(path, frames, sources, dtype=dtype, mark=mark)
-    else:
-        nbytes = dtype.itemsize * sum(map(math.prod, shapes.values()))
-        write_frames(path, frames, nbytes=nbytes, description=mark)
 
 
 def is_picture(output: Path) -> bool:
@@ -313,14 +333,18 @@ def is_folder(output: Path) -> bool:
     return output.suffix.lower() not in (".tif", ".tiff", ".png", *fits.SUFFIXES)
 
 
-def _outputs(output: Path, files: list[Path], display: Display | None) -> list[Path]:
-    """Name what will be written."""
+def _outputs(output: Path, files: list[Path], display: Display | None) -> dict[Path, list[Path]]:
+    """Name what will be written, each with its inputs."""
+    refuse_inputs(files, [], "is named twice: name each input once")
     if not is_folder(output):
-        return [output]
-    names = [f"{file.stem}.tif" if display else _name(file) for file in files]
-    if repeated := [name for name in names if names.count(name) > 1]:
-        raise FileError(f"{output}: two inputs would become '{repeated[0]}': correct them apart")
-    return [output / name for name in names]
+        outputs = {output: files}
+    else:
+        names = [f"{file.stem}.tif" if display else _name(file) for file in files]
+        if again := [name for name in names if names.count(name) > 1]:
+            raise FileError(f"{output}: two inputs would become '{again[0]}': correct them apart")
+        outputs = {output / name: [file] for name, file in zip(names, files, strict=True)}
+    refuse_inputs(outputs, files)
+    return outputs
 
 
 def is_corrected(description: str) -> bool:

@@ -19,6 +19,7 @@ from equipix.experiment.manifest import (
     CameraLight,
     CameraManifest,
     checked_content,
+    unreadable,
 )
 from equipix.findings import Finding, Rule, ask, say
 from equipix.io.paths import as_path
@@ -219,8 +220,8 @@ class CameraExperiment(Described[CameraManifest]):
         Notes
         -----
         The frames of a level are reduced to their mean and variance when they are read, so memory
-        does not grow with their number. Files of a sensor with filters are read once for each
-        plane.
+        does not grow with their number. They are read once for each plane of the colour filters.
+        Those of one level are read once more, to find colours that `cfa` does not name.
         """
         shape = self._shape()
         colours = Colours.of(self.manifest.sensor.cfa)
@@ -523,7 +524,7 @@ def _groups(path: Path) -> list[_Group]:
     try:
         lines = path.read_text(encoding="utf-8-sig", errors="surrogateescape").splitlines()
     except OSError as error:
-        raise FileError(f"{path}: cannot be read: {error.strerror}") from error
+        raise FileError(f"{path}: {unreadable(path, error)}") from error
     for number, line in enumerate(map(str.strip, lines), 1):
         kind, _, rest = line.partition(" ")
         if kind in _LINES:

@@ -11,18 +11,20 @@ from equipix._check import Array, Bools, union
 from equipix.errors import FileError
 from equipix.experiment.manifest import LevelManifest, Manifest, Taken, entry_files, name_of_dark
 from equipix.findings import Finding
+from equipix.io.formats import FrameFile
 from equipix.io.frames import Settings
-from equipix.measured.darks import (
+from equipix.measured.defects import hot_pixels
+from equipix.measured.settings import (
     KEYS,
     Shares,
     Wording,
     check_darks,
     common_settings,
+    in_words,
     mixed,
     other_settings,
     shares_of,
 )
-from equipix.measured.defects import hot_pixels
 from equipix.measured.statistics import FrameStatistics
 
 _WORDS = Wording(
@@ -104,7 +106,7 @@ def chosen(path: Path, manifest: Manifest | LevelManifest) -> Choice:
     kind = "level" if isinstance(manifest, LevelManifest) else "exposure"
 
     def known(place: str, taken: Taken) -> Settings:
-        files = entry_files(path, taken.frames, manifest.layout)
+        files = [*map(FrameFile, entry_files(path, taken.frames, manifest.layout))]
         return common_settings(place, taken.settings, files, tolerance, _WORDS)
 
     names = [name_of_dark(k, len(entries)) for k in range(len(entries))]
@@ -127,7 +129,7 @@ def chosen(path: Path, manifest: Manifest | LevelManifest) -> Choice:
     except FileError as error:
         raise FileError(f"{path}: {error}") from error
     called = [f"{name}{_in_brackets(each)}" for name, each in zip(names, darks, strict=True)]
-    return Choice(shares, [_words(each, called) for each in shares], findings)
+    return Choice(shares, [in_words(each, called) for each in shares], findings)
 
 
 def _in_brackets(settings: Settings) -> str:
@@ -135,9 +137,3 @@ def _in_brackets(settings: Settings) -> str:
     pairs = zip(settings, KEYS, strict=True)
     known = [f"{value:g} {unit}" for value, (_, unit, _) in pairs if value is not None]
     return f" ({', '.join(known)})" if known else ""
-
-
-def _words(shares: Shares, darks: Sequence[str]) -> str:
-    """Name the darks that an exposure takes, of two the share of each."""
-    used = [(share, dark) for share, dark in zip(shares, darks, strict=True) if share]
-    return " + ".join(dark if share == 1 else f"{share:.3g} × {dark}" for share, dark in used)

@@ -43,8 +43,8 @@ from equipix.io.formats import read_mask
 from equipix.io.paths import as_path
 from equipix.measured.average import average
 from equipix.measured.colour import Colours
-from equipix.measured.darks import settings_in
 from equipix.measured.means import Averaged
+from equipix.measured.settings import settings_in
 from equipix.measured.statistics import FrameStatistics, refuse_subtracted
 from equipix.shown import Brief
 

@@ -551,8 +551,7 @@ def read_manifest(path: Path, model: type[_Content]) -> _Content:
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
-        why = "is a folder" if path.is_dir() else f"cannot be read: {error.strerror}"
-        raise FileError(f"{path}: {why}, expected {_called(model)}") from error
+        raise FileError(f"{path}: {unreadable(path, error)}, expected {_called(model)}") from error
     except UnicodeDecodeError as error:
         if b"\0" in error.object:
             raise FileError(f"{path}: is no text, expected {_called(model)}") from None
@@ -561,6 +560,13 @@ def read_manifest(path: Path, model: type[_Content]) -> _Content:
     except tomllib.TOMLDecodeError as error:
         raise FileError(f"{path}: is not valid TOML: {error}") from error
     return checked_content(path, content, model)
+
+
+def unreadable(path: Path, error: OSError) -> str:
+    """Say why a file of text cannot be read."""
+    if isinstance(error, FileNotFoundError):
+        return "does not exist"
+    return "is a folder" if path.is_dir() else f"cannot be read: {error.strerror}"
 
 
 def _called(model: type[Table]) -> str:

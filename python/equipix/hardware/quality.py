@@ -1,8 +1,11 @@
 """How much quality C the words of a table cost, and which widths suffice."""
 
+from __future__ import annotations
+
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import takewhile
 from typing import Any, NamedTuple, Self
 
@@ -105,7 +108,10 @@ def quality(correction: Correction, frames: ArrayLike, **options: Any) -> Qualit
     >>> narrow.added > 10 * wide.added
     True
     """
-    level = _Level.of("frames", correction, frames)
+    return _quality(_Level.of("frames", correction, frames), correction, options)
+
+
+def _quality(level: _Level, correction: Correction, options: dict[str, Any]) -> Quality:
     with warnings.catch_warnings(action="ignore", category=InputWarning):  # what words cost is told
         table = Table.of(correction, **options)
     words = table.digitise(level.raw)[:, usable(table.flags)]
@@ -188,9 +194,68 @@ class Widths(Brief):
     worst: dict[str, tuple[int, str]]
 
 
+class Trial(NamedTuple):
+    """What words cost at one level, whose frames are not kept.
+
+    Attributes
+    ----------
+    planes : dict
+        As of `Quality`.
+    at_ends : int
+        As of `Quality`.
+    by_width : dict
+        By ``"offset"``, ``"gain"`` and ``"both"`` and the width, what the words add in the worst
+        plane, and its name.
+    """
+
+    planes: dict[str, Cost]
+    at_ends: int
+    by_width: dict[str, dict[int, tuple[float, str]]]
+
+
+_SOUGHT = {"offset_bits", "gain_bits"}
+"""Widths of which the smallest that suffice are sought."""
+
+
+def trial(correction: Correction, frames: ArrayLike, **options: Any) -> Trial:
+    """Find `quality` at one level, and what `widths_of` needs of it, with one correction of it."""
+    level = _Level.of("frames", correction, frames)
+    found = _quality(level, correction, options)
+    others = {name: value for name, value in options.items() if name not in _SOUGHT}
+    return Trial(found.planes, found.at_ends, _by_width(level, correction, others))
+
+
+def _by_width(
+    level: _Level, correction: Correction, options: dict[str, Any]
+) -> dict[str, dict[int, tuple[float, str]]]:
+    """Most that words of each width add at a level, and in which plane.
+
+    Tables are made anew for each level: kept, they would take as much memory as 100 frames.
+    """
+
+    @cache
+    def most(offset_bits: int, gain_bits: int) -> tuple[float, str]:
+        widths: dict[str, Any] = {"offset_bits": offset_bits, "gain_bits": gain_bits}
+        try:
+            table = Table.of(correction, **widths, **options)
+        except InputError:
+            # Words of usable pixels do not fit; with 16 bits they do.
+            return float("inf"), ""
+        added = level.added(table.correct(level.raw))
+        return max((each, plane) for plane, each in added.items())
+
+    with warnings.catch_warnings(action="ignore", category=InputWarning):
+        Table.of(correction, offset_bits=_BOTH, gain_bits=_BOTH, **options)
+        return {
+            "offset": {bits: most(bits, _BOTH) for bits in _WIDTHS},
+            "gain": {bits: most(_BOTH, bits) for bits in _WIDTHS},
+            "both": {bits: most(bits, bits) for bits in _WIDTHS},
+        }
+
+
 @naming_memory("widths of a table")
 def smallest_widths(
-    correction: Correction, levels: Sequence[ArrayLike], *, added: float = 0.1, **options: Any
+    correction: Correction, levels: Iterable[ArrayLike], *, added: float = 0.1, **options: Any
 ) -> Widths:
     """Find the smallest widths of the memories that cost no more than a share of the noise.
 
@@ -198,9 +263,9 @@ def smallest_widths(
     ----------
     correction : Correction
         The correction.
-    levels : sequence of array_like, shape (n, rows, cols) each
-        Raw frames of steady even levels; the worst one counts, and behind colour filters the worst
-        plane.
+    levels : iterable of array_like, shape (n, rows, cols) each
+        Raw frames of steady even levels, taken one at a time; the worst one counts, and behind
+        colour filters the worst plane.
     added : float
         Largest spatial noise that the words may add, over the temporal noise. 0.1 raises a C of 1
         to 1.005.
@@ -218,32 +283,30 @@ def smallest_widths(
         As of `quality`; or if `options` names a width that is sought.
     """
     positive("added", added)
-    sought = {"offset_bits", "gain_bits"} & set(options)
-    if sought or not len(levels):
-        raise InputError(f"{sorted(sought) or 'levels'}: expected levels, and no width of a memory")
-    measured = [_Level.of("levels", correction, frames) for frames in levels]
+    if sought := _SOUGHT & set(options):
+        raise InputError(f"{sorted(sought)}: expected levels, and no width of a memory")
+    tried = [
+        _by_width(_Level.of("levels", correction, frames), correction, options) for frames in levels
+    ]
+    if not tried:
+        raise InputError("levels: expected levels, and no width of a memory")
+    return widths_of(tried, added=added)
 
-    def worst(offset_bits: int, gain_bits: int) -> tuple[float, tuple[int, str]]:
-        """Most that words add, and where; infinite where those of usable pixels do not fit."""
-        widths: dict[str, Any] = {"offset_bits": offset_bits, "gain_bits": gain_bits}
-        try:
-            table = Table.of(correction, **widths, **options)
-        except InputError:
-            # With 16 bits they fit.
-            return float("inf"), (0, "")
-        return max(
-            (each, (number, plane))
-            for number, level in enumerate(measured)
-            for plane, each in level.added(table.correct(level.raw)).items()
-        )
 
-    with warnings.catch_warnings(action="ignore", category=InputWarning):
-        Table.of(correction, offset_bits=_BOTH, gain_bits=_BOTH, **options)
-        found = {
-            "offset": {bits: worst(bits, _BOTH) for bits in _WIDTHS},
-            "gain": {bits: worst(_BOTH, bits) for bits in _WIDTHS},
-            "both": {bits: worst(bits, bits) for bits in _WIDTHS},
+def widths_of(
+    levels: Sequence[dict[str, dict[int, tuple[float, str]]]], *, added: float = 0.1
+) -> Widths:
+    """Find the smallest widths that suffice at all levels, of what `Trial.by_width` has of each."""
+    found = {
+        name: {
+            bits: max(
+                (cost, (k, plane))
+                for k, (cost, plane) in enumerate(level[name][bits] for level in levels)
+            )
+            for bits in _WIDTHS
         }
+        for name in levels[0]
+    }
     costs = {name: {bits: each for bits, (each, _) in of.items()} for name, of in found.items()}
     enough = {name: _first(of, added) for name, of in costs.items()}
     where = {name: found[name][bits or _BOTH][1] for name, bits in enough.items()}

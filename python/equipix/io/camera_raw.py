@@ -40,22 +40,19 @@ class Told(NamedTuple):
         return np.tile(once, repeats)[: shape[0], : shape[1]]
 
 
-def header(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any], str]:
-    """Shape (1, rows, cols) and dtype of the counts; no text."""
+def header(
+    path: Path,
+) -> tuple[tuple[int, int, int], np.dtype[Any], str, tuple[float | None]]:
+    """Shape (1, rows, cols) and dtype of the counts, no text, and the exposure time in seconds."""
     with _opened(path) as raw:
-        return (1, raw.sizes.height, raw.sizes.width), np.dtype(np.uint16), ""
+        shape = (1, raw.sizes.height, raw.sizes.width)
+        return shape, np.dtype(np.uint16), "", (float(raw.other.shutter_speed) or None,)
 
 
 def stream_frames(path: Path) -> Iterator[NDArray[Any]]:
     """Counts of the sensor, without its dark border, in the one frame of a file."""
     with _opened(path) as raw:
         yield raw.raw_image_visible[None].copy()
-
-
-def exposure_s(path: Path) -> float | None:
-    """Exposure time, in seconds, where the file holds it."""
-    with _opened(path) as raw:
-        return float(raw.other.shutter_speed) or None
 
 
 def told(path: Path) -> Told:

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,29 +99,6 @@ def read_pages(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
         return pages, units[_TEXT].data.tobytes().decode()
 
 
-def description(path: Path) -> str:
-    """Text stored with a result; empty where there is none."""
-    with _astropy().open(path) as units:
-        return units[_TEXT].data.tobytes().decode() if _TEXT in units else ""
-
-
-def settings(path: Path) -> tuple[float | None, float | None]:
-    """Exposure time in s and temperature in °C, where the headers of a file hold them.
-
-    Programs write a time below 0, as -1, where they do not know it.
-    """
-    with _astropy().open(path) as units:
-        time = _keyword(units, "EXPTIME", "EXPOSURE", least=0)
-        return time, _keyword(units, "CCD-TEMP", "SET-TEMP")
-
-
-def image_type(path: Path) -> str:
-    """What an image shows in the words of its header, such as "Dark Frame"; empty without any."""
-    with _astropy().open(path) as units:
-        found = (unit.header.get(name) for name in _TYPES for unit in units)
-        return next((value for value in found if isinstance(value, str)), "")
-
-
 def _keyword(units: Any, *names: str, least: float = -math.inf) -> float | None:
     """First number from the least on that a header holds under some keywords."""
     found = (unit.header[name] for name in names for unit in units if name in unit.header)
@@ -129,18 +106,40 @@ def _keyword(units: Any, *names: str, least: float = -math.inf) -> float | None:
     return next((value for value in numbers if value >= least), None)
 
 
-def header(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any], str]:
-    """Shape (n, rows, cols) and dtype of the frames of a file, none of which is decoded; its text.
+class ImageType(NamedTuple):
+    """What an image shows in the words of its header, such as "Dark Frame", and their keyword."""
 
-    All images of one shape count, those of a cube one by one.
+    value: str = ""
+    keyword: str = ""
+
+
+Header = tuple[
+    tuple[int, int, int], np.dtype[Any], str, tuple[float | None, float | None], ImageType
+]
+"""Shape and dtype of frames, text, exposure time in s and temperature in °C, type of image."""
+
+
+def header(path: Path) -> Header:
+    """Read what a file holds beside its frames, none of which is decoded, in one go.
+
+    All images of one shape count, those of a cube one by one. Of a result that was saved, whose
+    text says so, images may be of several shapes.
     """
     with _astropy().open(path) as units:
-        images = _images(path, units)
+        text = units[_TEXT].data.tobytes().decode() if _TEXT in units else ""
+        images = _every_image(units) if text else _images(path, units)
         *_, rows, cols = images[0].shape
         count = sum(int(np.prod(unit.shape[:-2])) for unit in images)
-        text = units[_TEXT].data.tobytes().decode() if _TEXT in units else ""
         text = text or str(images[0].header.get(_MARK, ""))
-        return (count, rows, cols), native(_part(images[0], 1)).dtype, text
+        # Programs write a time below 0, as -1, where they do not know it.
+        time = _keyword(units, "EXPTIME", "EXPOSURE", least=0)
+        taken = time, _keyword(units, "CCD-TEMP", "SET-TEMP")
+        return (count, rows, cols), native(_part(images[0], 1)).dtype, text, taken, _type(units)
+
+
+def _type(units: Any) -> ImageType:
+    found = (ImageType(unit.header.get(name), name) for name in _TYPES for unit in units)
+    return next((each for each in found if isinstance(each.value, str)), ImageType())
 
 
 def stream_frames(path: Path) -> Iterator[NDArray[Any]]:
@@ -235,7 +234,7 @@ def _part(unit: Any, size: int | None, index: tuple[int, ...] = ()) -> Any:
 
 def _images(path: Path, units: Any) -> list[Any]:
     """Images of a file; those that extend an empty primary header count too."""
-    images = [unit for unit in units if unit.is_image and len(unit.shape) >= 2]
+    images = _every_image(units)
     shapes = list(dict.fromkeys(unit.shape[-2:] for unit in images))
     if not shapes:
         held = ", ".join(f"{unit.name} {unit.shape}" for unit in units if unit.is_image)
@@ -250,3 +249,7 @@ def _images(path: Path, units: Any) -> list[Any]:
         held = ", ".join(f"{unit.name} {unit.shape}" for unit in images)
         raise FileError(f"{path}: holds images of several shapes ({held}), expected one")
     return images
+
+
+def _every_image(units: Any) -> list[Any]:
+    return [unit for unit in units if unit.is_image and len(unit.shape) >= 2]

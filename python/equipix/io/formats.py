@@ -3,6 +3,7 @@
 import json
 import zlib
 from collections.abc import Callable, Iterable, Mapping
+from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,17 @@ import numpy as np
 from equipix._check import Array, Bools
 from equipix.errors import FileError, InputError
 from equipix.io import arrays, asdf, fits, nexus, tiff
-from equipix.io.frames import Header, frame_format, header, read_frames, suffix_of
-from equipix.io.paths import as_path, reading, write_whole
+from equipix.io.frames import (
+    WITH_HEADERS,
+    Header,
+    Settings,
+    frame_format,
+    header,
+    read_frames,
+    settings,
+    suffix_of,
+)
+from equipix.io.paths import as_path, find_files, reading, write_whole
 from equipix.io.viewed import Viewed
 
 _TEXT = "metadata"
@@ -57,11 +67,10 @@ _FORMATS = {
 
 _DESCRIPTIONS = {
     ".npz": _npz_description,
-    **dict.fromkeys(fits.SUFFIXES, fits.description),
     **dict.fromkeys(nexus.SUFFIXES, nexus.description),
     **dict.fromkeys(asdf.SUFFIXES, asdf.description),
 }
-"""What reads the text alone; that of a TIFF is the first page's description."""
+"""What reads the text alone; that of a TIFF and of FITS stands in the header."""
 
 SUFFIXES = tuple(_FORMATS)
 
@@ -182,16 +191,71 @@ def _parsed(text: str) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
+class FrameFile(PathLike[str]):
+    """A file of frames, or of what stands in their place, whose header is read once.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __fspath__(self) -> str:
+        """Return the name, so that the file is a path too."""
+        return str(self.path)
+
+    @cached_property
+    def header(self) -> Header:
+        """What the file holds beside its frames."""
+        return header(self.path)
+
+    @cached_property
+    def settings(self) -> Settings:
+        """Exposure time and temperature in its header or EXIF."""
+        in_header = suffix_of(self.path) in WITH_HEADERS
+        return self.header.settings if in_header else settings(self.path)
+
+    @property
+    def image_type(self) -> fits.ImageType:
+        """What the frames show by the header of a FITS file."""
+        is_fits = suffix_of(self.path) in fits.READ
+        return self.header.image_type if is_fits else fits.ImageType()
+
+    @cached_property
+    def content(self) -> dict[str, Any]:
+        """Metadata that `save_pages` wrote; empty of other files."""
+        if suffix_of(self.path) in fits.SUFFIXES:
+            return _parsed(self.header.description)
+        return _saved_content(self.path)
+
+    @property
+    def kind(self) -> str | None:
+        """Kind of a result in the place of frames; None of other files."""
+        return _kind(self.content)
+
+
+def frame_files(source: Iterable[str | PathLike[str]]) -> list[FrameFile]:
+    """Files that names or globs name; those whose headers are known stay as they are."""
+    given = list(source)
+    known = [each for each in given if isinstance(each, FrameFile)]
+    return known if len(known) == len(given) else [*map(FrameFile, find_files(given))]
+
+
+def _kind(content: dict[str, Any]) -> str | None:
+    kind = content.get("kind")
+    return kind if isinstance(kind, str) else None
+
+
 def saved_kind(path: Path) -> str | None:
     """Kind of content in a file that stands in the place of frames; None of other files."""
-    return _kind(saved_content(path))
+    return FrameFile(path).kind
 
 
-def saved_content(path: Path) -> dict[str, Any]:
-    """Metadata in a file that `save_pages` wrote; empty of other files.
-
-    Files of whole numbers, which cameras write, are not searched.
-    """
+def _saved_content(path: Path) -> dict[str, Any]:
+    """Metadata in a file; those of whole numbers, which cameras write, are not searched."""
     suffix = suffix_of(path)
     if suffix in _DESCRIPTIONS:
         file, _ = arrays.split(path)
@@ -199,11 +263,6 @@ def saved_content(path: Path) -> dict[str, Any]:
             return _parsed(_DESCRIPTIONS[suffix](file))
     is_searched = suffix in SUFFIXES and frame_format(path)[1].kind == "f"
     return _parsed(header(path).description) if is_searched else {}
-
-
-def _kind(content: dict[str, Any]) -> str | None:
-    kind = content.get("kind")
-    return kind if isinstance(kind, str) else None
 
 
 def refuse_saved(path: Path) -> None:
@@ -224,7 +283,7 @@ def _refuse_kind(path: Path, kind: str | None, wanted: str = "raw frames") -> No
 
 
 def raw_headers(files: Iterable[Path], shape: tuple[int, int]) -> dict[Path, Header]:
-    """What files say of their frames, which must be raw and of the sensor's shape."""
+    """What files hold beside their frames, which must be raw and of the sensor's shape."""
     headers = {file: raw_header(file) for file in files}
     for file, found in headers.items():
         if found.shape[1:] != shape:
@@ -233,10 +292,11 @@ def raw_headers(files: Iterable[Path], shape: tuple[int, int]) -> dict[Path, Hea
 
 
 def raw_header(path: Path) -> Header:
-    """Shape, dtype and text of raw frames; what `save_pages` wrote is refused like there."""
-    if suffix_of(path) in _DESCRIPTIONS:
-        refuse_saved(path)
-    found = header(path)
+    """What a file holds beside raw frames; what `save_pages` wrote is refused like there."""
+    file = FrameFile(path)
+    if suffix_of(path) in (*_DESCRIPTIONS, *fits.SUFFIXES):
+        _refuse_kind(path, file.kind)
+    found = file.header
     _refuse_kind(path, _kind(_parsed(found.description)) if found.dtype.kind == "f" else None)
     return found
 

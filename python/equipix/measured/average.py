@@ -6,7 +6,6 @@ import operator
 import os
 from collections.abc import Iterable, Iterator
 from os import PathLike
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,20 +23,18 @@ from equipix._check import (
     positive_workers,
 )
 from equipix.errors import FileError, InputError
-from equipix.io.formats import ONLY_RESULTS
+from equipix.io.formats import ONLY_RESULTS, FrameFile, frame_files
 from equipix.io.frames import (
     check_image,
     frame_format,
     is_image,
     leaving_others,
-    settings,
     stream_frames,
 )
-from equipix.io.paths import find_files
 from equipix.io.record import made, now, read_record
-from equipix.measured.darks import furthest, taken_with
 from equipix.measured.saturation import level_of
-from equipix.measured.statistics import FrameStatistics, _masked, _step, _subtract, saved_shape
+from equipix.measured.settings import furthest, taken_with
+from equipix.measured.statistics import FrameStatistics, _masked, _step, _subtract, is_average
 from equipix.measured.stream import Rejection, batches, sum_dtype, unmasked
 
 
@@ -82,8 +79,8 @@ def average(
     Returns
     -------
     FrameStatistics
-        Mean, unbiased variance of one frame, variance of the mean, and counts. Of FITS and raw
-        files `metadata` hold ``exposure_s`` and ``temperature_c``, where the headers agree.
+        Mean, unbiased variance of one frame, variance of the mean, and counts. Of files `metadata`
+        hold ``exposure_s`` and ``temperature_c``, where headers or EXIF agree.
 
     Raises
     ------
@@ -137,9 +134,9 @@ def average(
     common: dict[str, float] = {}
     with naming_memory("averaging"):
         if isinstance(taken, list):
-            paths = find_files(taken)
-            statistics = _average_files(paths, how)
-            common = taken_with(paths)
+            files = frame_files(taken)
+            statistics = _average_files(files, how)
+            common = taken_with(files)
         else:
             statistics = _average_batches(batches(taken), how, operator.length_hint(frames))
         if not statistics.count.any():
@@ -182,12 +179,13 @@ def _paths_or_frames(source: Any) -> list[Any] | Array | Iterator[Any]:
     raise InputError("'frames' holds no frames")
 
 
-def _average_files(paths: list[Path], how: _How) -> FrameStatistics:
+def _average_files(files: list[FrameFile], how: _How) -> FrameStatistics:
+    paths = [file.path for file in files]
     LOG.info("files to average: %d, the first %s", len(paths), paths[0])
     LOG.debug("reads %s", ", ".join(map(str, paths)))
-    _refuse_mixed(paths)
+    _refuse_mixed(files)
     if any(path.suffix.lower() in ONLY_RESULTS for path in paths):
-        return _saved(paths, how)
+        return _saved(files, how)
     if how.rejection is None and all(map(is_image, paths)):
         for path in paths:
             check_image(path)
@@ -196,18 +194,18 @@ def _average_files(paths: list[Path], how: _How) -> FrameStatistics:
             mask = as_mask(how.mask, shape[1:])
             maps = _native.average_files(paths, how.level, mask, how.workers, how.progress)
             return _statistics(maps, dtype, level_of(dtype, how.level))
-    if any(saved_shape(path) for path in paths):
-        return _saved(paths, how)
+    if any(map(is_average, files)):
+        return _saved(files, how)
     stream = stream_frames(paths, workers=how.workers)
     given = batches(frame for _, frames in stream for frame in frames)
     return _average_batches(given, how, len(paths))
 
 
-def _refuse_mixed(paths: list[Path]) -> None:
+def _refuse_mixed(files: list[FrameFile]) -> None:
     """Refuse files of different exposure times, where they hold them."""
-    if len(paths) < 2:
+    if len(files) < 2:
         return
-    held = {path: settings(path) for path in paths}
+    held = {file.path: file.settings for file in files}
     if ends := furthest(held, 0, 0.0):
         (least, low), (most, high) = ((path, held[path].exposure_s) for path in ends)
         raise FileError(
@@ -216,9 +214,9 @@ def _refuse_mixed(paths: list[Path]) -> None:
         )
 
 
-def _saved(paths: list[Path], how: _How) -> FrameStatistics:
+def _saved(files: list[FrameFile], how: _How) -> FrameStatistics:
     """Read the one average that is given in the place of frames."""
-    path, *others = sorted(paths, key=lambda path: saved_shape(path) is None)
+    path, *others = (file.path for file in sorted(files, key=is_average, reverse=True))
     if others:
         raise FileError(
             f"{path}: holds averaged frames, which cannot be averaged with other files: name one "

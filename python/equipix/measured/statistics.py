@@ -23,7 +23,7 @@ import numpy as np
 from equipix._check import Array, Floats, check_maps
 from equipix.errors import InputError
 from equipix.findings import Finding, Rule
-from equipix.io.formats import refuse_saved, saved_kind
+from equipix.io.formats import FrameFile, refuse_saved
 from equipix.io.record import Counts, Doubles, Record, read_record
 from equipix.io.viewed import Viewed
 from equipix.measured.noise import scatter_limit, step_of
@@ -118,12 +118,17 @@ class FrameStatistics(Record, kind="frame statistics", version=3):
         return {name: getattr(self, name) for name in _MAPS}
 
 
+def is_average(file: FrameFile) -> bool:
+    """Whether a file holds an average in the place of frames. A calibration is an error."""
+    if file.kind not in (None, FrameStatistics.KIND):
+        refuse_saved(file.path)
+    return file.kind is not None
+
+
 def saved_shape(path: Path) -> tuple[int, int] | None:
     """Rows and columns of the averages in a file; None of frames. A calibration is an error."""
-    if (kind := saved_kind(path)) is None:
+    if not is_average(FrameFile(path)):
         return None
-    if kind != FrameStatistics.KIND:
-        refuse_saved(path)
     rows, cols = read_record(path, FrameStatistics).mean.shape
     return rows, cols
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -176,17 +176,22 @@ def camera_checks(found: CameraFigures, limits: CameraLimits) -> list[Check]:
     return checked(limits, {key: each.value for key, each in figures.items()}, found.findings, told)
 
 
-def camera_parts(name: str, planes: dict[str, CameraFigures], limits: CameraLimits) -> list[Part]:
-    """Collect what a page says of a camera: a part for each plane of its colour filters."""
+def camera_parts(
+    name: str, planes: dict[str, CameraFigures], judged: Iterable[list[Check]]
+) -> list[Part]:
+    """Collect what a page says of a camera: a part for each plane of its colour filters.
+
+    `judged` has the checks of each.
+    """
     largest, (first, *_), last = int(LARGEST / len(planes) ** 0.5), planes, [*planes][-1]
     parts = []
-    for plane, found in planes.items():
+    for (plane, found), checks in zip(planes.items(), judged, strict=True):
         maps = _maps(found)
         part = Part(
             name=f"{name}, plane {plane}" if plane else name,
             what=f"EMVA 1288 release 4.0 linear, {len(found.photons)} levels",
             findings=found.findings,
-            checks=camera_checks(found, limits),
+            checks=checks,
             figures=_words_of(found),
             maps=[mapped(each, largest) for each in maps],
             plots=[*map(drawn, _curves(found, maps))],

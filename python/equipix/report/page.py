@@ -185,22 +185,26 @@ def comparison_parts(
     comparison: Comparison,
     files: Sequence[Path],
     calibrations: Sequence[Calibration],
-    limits: ComparisonLimits,
+    judged: Mapping[str, list[Check]],
 ) -> list[Part]:
-    """Collect what a page says of calibrations that were compared: a part for each pair."""
+    """Collect what a page says of calibrations that were compared: a part for each pair.
+
+    `judged` has the name and the checks of each.
+    """
     parts, largest = [], int(LARGEST / len(comparison.pairs) ** 0.5)
     scatter, hashes = maps_of(comparison)[0], sha256_of(files)
-    for number, (i, j) in enumerate(comparison.pairs):
+    pairs = zip(comparison.pairs, judged.items(), strict=True)
+    for number, ((i, j), (name, checks)) in enumerate(pairs):
         maps = [*difference_maps("Difference", comparison.difference(number)), scatter]
         curves = (draw_histogram, draw_spectrum, draw_profiles)
         findings = tuple(dict.fromkeys(calibrations[i].findings + calibrations[j].findings))
         told = [(str(files[k]), repr(calibrations[k]).strip("<>")) for k in (i, j)]
         parts.append(
             Part(
-                name=f"{files[i]} − {files[j]}",
+                name=name,
                 what=f"{comparison.verdicts[number]}.".capitalize(),
                 findings=findings,
-                checks=comparison_checks(comparison, number, findings, limits),
+                checks=checks,
                 figures=words_of(summary(comparison), without=("verdicts",)),
                 maps=[mapped(each, largest) for each in maps],
                 plots=[drawn(partial(draw, shown=maps[0])) for draw in curves],

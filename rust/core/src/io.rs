@@ -97,6 +97,14 @@ pub fn describe(path: &Path, control: &Control) -> Result<(usize, Shape, u32)> {
     Ok((pages(path, control)?.len(), shape, bits))
 }
 
+/// Exposure time in s of a TIFF file, where a tag of its first page or its EXIF holds one.
+///
+/// # Errors
+/// [`Error::File`] or [`Error::Unsupported`], as in [`average`].
+pub fn exposure_s(path: &Path, control: &Control) -> Result<Option<f64>> {
+    guarded(path, control, || tiff::exposure_s(Source::open(path, None, control)?))
+}
+
 /// What all frames of a job have in common.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Format {

@@ -149,6 +149,12 @@ pub(crate) fn file_format(py: Python<'_>, path: PathBuf) -> PyResult<(usize, usi
     Ok((count, shape.rows, shape.cols, bits))
 }
 
+/// Exposure time in s of a TIFF file; None where it holds none.
+#[pyfunction]
+pub(crate) fn exposure_s(py: Python<'_>, path: PathBuf) -> PyResult<Option<f64>> {
+    run::brief(py, |control| io::exposure_s(&path, control))
+}
+
 fn stack<T: Element>(py: Python<'_>, frames: Frames<T>) -> PyResult<Bound<'_, PyAny>> {
     let Frames { count, shape, data } = frames;
     Ok(data.into_pyarray(py).reshape([count, shape.rows, shape.cols])?.into_any())

@@ -31,7 +31,7 @@ mod _native {
     #[pymodule_export]
     use crate::apply::PyCorrector;
     #[pymodule_export]
-    use crate::average::{Accumulator, average_files, file_format, read_file};
+    use crate::average::{Accumulator, average_files, exposure_s, file_format, read_file};
     #[pymodule_export]
     use crate::centroid::locate_spots;
     #[pymodule_export]

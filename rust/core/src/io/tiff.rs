@@ -3,6 +3,7 @@
 use std::collections::HashSet;
 use std::io::{BufRead, BufReader};
 
+use tiff::decoder::ifd::Value;
 use tiff::decoder::{ChunkType, Decoder, DecodingSampleType, Limits};
 use tiff::tags::{CompressionMethod, PhotometricInterpretation, Tag};
 use tiff::{ColorType, TiffError};
@@ -17,6 +18,9 @@ const BIG_TIFF_BIG: &[u8] = &[0, 43];
 
 /// Directory entry of MetaMorph stacks, whose frames have no directories.
 const UIC2: Tag = Tag::Unknown(33629);
+
+/// Exposure time in s, of DNG in the directory of the page, of other files in that of EXIF.
+const EXPOSURE_TIME: Tag = Tag::Unknown(33434);
 
 /// Bits of `NewSubfileType`: a reduced copy of another page, or a mask.
 const NOT_A_FRAME: u32 = 0b101;
@@ -66,6 +70,24 @@ fn hides_frames(decoder: &mut PageDecoder, pages: usize) -> bool {
     let imagej = description.starts_with("ImageJ=") && images().is_some_and(|n: usize| n > pages);
     let shaped = description.starts_with('{') && description.contains("\"truncated\"");
     imagej || shaped || decoder.image_ifd().find_entry(UIC2).is_some()
+}
+
+/// Exposure time in s that the first page holds.
+pub(super) fn exposure_s(source: Source) -> Outcome<Option<f64>> {
+    let mut decoder = decoder(source)?;
+    let mut found = decoder.find_tag(EXPOSURE_TIME)?;
+    if found.is_none()
+        && let Some(exif) = decoder.find_tag(Tag::ExifDirectory)?
+    {
+        let directory = decoder.read_directory(exif.into_ifd_pointer()?)?;
+        found = decoder.read_directory_tags(&directory).find_tag(EXPOSURE_TIME)?;
+    }
+    Ok(match found {
+        Some(Value::Rational(over, under)) if under != 0 => {
+            Some(f64::from(over) / f64::from(under))
+        }
+        _ => None,
+    })
 }
 
 /// The decoder of a file's first page.

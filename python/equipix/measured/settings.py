@@ -9,8 +9,8 @@ import numpy as np
 
 from equipix.errors import FileError
 from equipix.findings import Finding
-from equipix.io.formats import saved_content
-from equipix.io.frames import Settings, apart, is_image, settings
+from equipix.io.formats import FrameFile
+from equipix.io.frames import Settings, apart
 from equipix.measured.statistics import FrameStatistics
 
 KEYS = (("exposure_s", "s", "exposure time"), ("temperature_c", "°C", "temperature"))
@@ -41,11 +41,11 @@ class Wording(NamedTuple):
     several: str
 
 
-def settings_of(file: Path) -> Settings:
+def settings_of(file: FrameFile) -> Settings:
     """Exposure time and temperature of frames by their headers, of a saved average by its own."""
-    if fields := saved_content(file).get("fields"):  # other programs write JSON of their own
+    if fields := file.content.get("fields"):  # other programs write JSON of their own
         return settings_in(fields.get("metadata", {}))
-    return settings(file)
+    return file.settings
 
 
 def settings_in(metadata: Mapping[str, Any]) -> Settings:
@@ -82,11 +82,17 @@ def mixed(darks: Sequence[FrameStatistics], shares: Shares) -> FrameStatistics:
     )
 
 
+def in_words(shares: Shares, names: Sequence[str]) -> str:
+    """Name the darks that an exposure or file takes, of two the share of each, in ASCII."""
+    used = [(share, name) for share, name in zip(shares, names, strict=True) if share]
+    return " + ".join(name if share == 1 else f"{share:.4g} of {name}" for share, name in used)
+
+
 def common_settings(
-    place: str, stated: Settings, files: Sequence[Path], tolerance: float, words: Wording
+    place: str, stated: Settings, files: Sequence[FrameFile], tolerance: float, words: Wording
 ) -> Settings:
     """Exposure time and temperature of some files: as stated, else the mean of what they hold."""
-    read = {file: settings_of(file) for file in files}
+    read = {file.path: settings_of(file) for file in files}
     found = [
         mean if value is None else value
         for value, mean in zip(stated, _mean(read.values()), strict=True)
@@ -160,9 +166,9 @@ def other_settings(
     return tuple(found)
 
 
-def average_findings(frames: Sequence[Path], dark: Sequence[Path]) -> tuple[Finding, ...]:
+def average_findings(frames: Sequence[FrameFile], dark: Sequence[FrameFile]) -> tuple[Finding, ...]:
     """Findings on frames of one average, and on their dark, by what their files hold."""
-    held = {file: settings(file) for file in frames}
+    held = {file.path: file.settings for file in frames}
     named = [(f"'{file.name}'", each) for file, each in held.items()]
     found: tuple[Finding, ...] = ()
     if ends := furthest(held, 1, TOLERANCE_K):
@@ -179,14 +185,9 @@ def average_findings(frames: Sequence[Path], dark: Sequence[Path]) -> tuple[Find
     return found
 
 
-def taken_with(files: Sequence[Path]) -> dict[str, float]:
-    """What frames in files other than images were all taken with, for the metadata of a mean.
-
-    Images are left out: they seldom hold it, and many small ones are read faster than their EXIF.
-    """
-    if any(map(is_image, files)):
-        return {}
-    held = list(map(settings_of, files))
+def taken_with(files: Sequence[FrameFile]) -> dict[str, float]:
+    """What frames were all taken with, for the metadata of their mean."""
+    held = [file.settings for file in files]
     found = _mean(held)
     if any(apart(k, found[k], each[k], TOLERANCE_K) for each in held for k in range(len(KEYS))):
         return {}

@@ -1,6 +1,6 @@
 """The dark of each file of frames, and what shows that it is another than theirs."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -11,16 +11,16 @@ from equipix._check import Array
 from equipix.correction.protocol import Correction, refuse_dark, sensor_table
 from equipix.errors import FileError, InputError
 from equipix.findings import Finding, Findings, say
-from equipix.io.formats import saved_kind
-from equipix.io.frames import Settings, image_type, settings
-from equipix.io.paths import find_files
+from equipix.io.formats import FrameFile, frame_files
+from equipix.io.frames import Header, Settings
 from equipix.measured.average import average
-from equipix.measured.darks import (
+from equipix.measured.settings import (
     TOLERANCE_K,
     Shares,
     Wording,
     check_darks,
     common_settings,
+    in_words,
     other_settings,
     settings_in,
     shares_of,
@@ -45,6 +45,9 @@ _QUOTE = (
     "leave them out, and quote patterns: of --dark d*.fits without quotes the shell gives all but "
     "the first file as frames"
 )
+
+_WORDED = ("stored", "none")
+"""What stands in the place of names of darks."""
 
 _LIGHT = ("light", "object", "science", "flat")
 """What types of images with light contain."""
@@ -85,13 +88,11 @@ class FileDarks:
 
     def named(self, file: Path) -> str:
         """Return the dark of a file in words."""
-        pairs = zip(self.shares[file], self.names, strict=True)
-        used = [(share, name) for share, name in pairs if share]
-        return " + ".join(name if share == 1 else f"{share:.4g} {name}" for share, name in used)
+        return in_words(self.shares[file], self.names)
 
 
 def file_darks(
-    correction: Correction, names: Sequence[str] | None, files: Sequence[Path]
+    correction: Correction, names: Sequence[str] | None, headers: Mapping[Path, Header]
 ) -> FileDarks:
     """Choose the dark of each file by exposure time and temperature, and average those used.
 
@@ -105,67 +106,90 @@ def file_darks(
         If the correction needs a dark, or takes none.
     """
     names = tuple(names or ("stored",))
-    tolerance = sensor_table(correction.metadata).get("dark_temperature_tolerance_c", TOLERANCE_K)
-    shown = {file: _shown(file) for file in files}
-    said = _warn_of_dark_frames([file for file in files if "dark" in shown[file]])
-    one: dict[Path, Shares] = dict.fromkeys(files, (1.0,))
-    if names == ("stored",):
-        if correction.needs_dark:
-            raise InputError(
-                "this correction holds no dark frame, and 'dark' (--dark) is 'stored': give dark "
-                "frames, or 'none' (--dark none) if the dark is subtracted from the frames already"
-            )
-        known = settings_in(correction.metadata.get("dark_settings", {}))
-        said += _warn_of_settings("the dark of the correction", known, files, tolerance)
-        return FileDarks(names, {}, one, findings=said)
+    if any(name in _WORDED for name in names):
+        return _worded(correction, names, headers)
     refuse_dark(correction, names[0])
-    if names == ("none",):
-        return FileDarks(names, {}, one, findings=said)
-    if word := {"stored", "none"} & set(names):
-        raise InputError(f"'dark' (--dark) is '{word.pop()}' and names files too: leave out one")
-    groups = [find_files(name) for name in names]
+    groups = [frame_files([name]) for name in names]
     _refuse_light([file for group in groups for file in group])
     places = [f"'dark' (--dark) {name}" for name in names]
+    tolerance = _tolerance(correction)
     darks = [
         common_settings(place, Settings(), group, tolerance, _WORDS)
         for place, group in zip(places, groups, strict=True)
     ]
-    shares = one
+    said = _warn_of_dark_frames(headers)
     if len(names) == 1:
-        said += _warn_of_settings(places[0], darks[0], files, tolerance)
+        shares: dict[Path, Shares] = dict.fromkeys(headers, (1.0,))
+        said += _warn_of_settings(places[0], darks[0], headers, tolerance)
     else:
         check_darks(places, darks, (), _WORDS)
         shares = {
-            file: shares_of(str(file), settings(file), darks, tolerance, _WORDS) for file in files
+            file: shares_of(str(file), each.settings, darks, tolerance, _WORDS)
+            for file, each in headers.items()
         }
     used = [k for k in range(len(names)) if any(each[k] for each in shares.values())]
-    means = {k: _mean(places[k], groups[k]) for k in used}
-    # The shell leaves one file of frames of an unquoted pattern, and gives the others as frames.
-    bare = [Path(name) for name in names] == groups[0] and saved_kind(groups[0][0]) is None
-    suspects = frozenset(file for file in files if bare and len(files) > 1 and not shown[file])
-    return FileDarks(names, means, shares, suspects, said)
+    means = {k: _mean(groups[k]) for k in used}
+    return FileDarks(names, means, shares, _suspects(names, groups[0], headers), said)
 
 
-def _mean(place: str, files: list[Path]) -> Array:
+def _worded(
+    correction: Correction, names: tuple[str, ...], headers: Mapping[Path, Header]
+) -> FileDarks:
+    """Take the dark of the correction, or none."""
+    name, *others = sorted(names, key=lambda name: name not in _WORDED)
+    if others:
+        also = "twice: give it once" if name in others else "and names files too: leave out one"
+        raise InputError(f"'dark' (--dark) is '{name}' {also}")
+    said = _warn_of_dark_frames(headers)
+    if name == "none":
+        refuse_dark(correction, name)
+    elif correction.needs_dark:
+        raise InputError(
+            "this correction holds no dark frame, and 'dark' (--dark) is 'stored': give dark "
+            "frames, or 'none' (--dark none) if the dark is subtracted from the frames already"
+        )
+    else:
+        known = settings_in(correction.metadata.get("dark_settings", {}))
+        place = "the dark of the correction"
+        said += _warn_of_settings(place, known, headers, _tolerance(correction))
+    return FileDarks(names, {}, dict.fromkeys(headers, (1.0,)), findings=said)
+
+
+def _tolerance(correction: Correction) -> float:
+    """Difference of temperatures at which a dark still fits."""
+    sensor = sensor_table(correction.metadata)
+    return float(sensor.get("dark_temperature_tolerance_c", TOLERANCE_K))
+
+
+def _mean(files: list[FrameFile]) -> Array:
     """Average a dark."""
     statistics = average(files)
-    refuse_subtracted(statistics, place)
+    refuse_subtracted(statistics, str(files[0].path))
     return statistics.mean
 
 
-def _shown(file: Path) -> str:
-    """What an image shows by its header, in lower case."""
-    return image_type(file).lower()
+def _suspects(
+    names: Sequence[str], dark: Sequence[FrameFile], headers: Mapping[Path, Header]
+) -> frozenset[Path]:
+    """Files of frames that may be dark frames, of a pattern without quotes.
+
+    The shell leaves one file of such a pattern to the option, and gives the others as frames.
+    """
+    is_bare = [Path(name) for name in names] == [dark[0].path] and dark[0].kind is None
+    if not is_bare or len(headers) < 2:
+        return frozenset()
+    return frozenset(file for file, each in headers.items() if not each.image_type.value)
 
 
-def _refuse_light(darks: Sequence[Path]) -> None:
+def _refuse_light(darks: Sequence[FrameFile]) -> None:
     """Refuse frames that are no dark by their headers."""
     for file in darks:
-        shown = _shown(file)
+        value, keyword = file.image_type
+        shown = value.lower()
         if "dark" not in shown and any(word in shown for word in _LIGHT):
             raise FileError(
-                f"{file}: is '{image_type(file)}' by its header (IMAGETYP), expected dark frames "
-                "in 'dark' (--dark)"
+                f"{file.path}: is '{value}' by its header ({keyword}), expected dark frames in "
+                "'dark' (--dark)"
             )
 
 
@@ -174,8 +198,9 @@ def _some(files: Sequence[Path]) -> str:
     return f"{files[0]}{f' and {len(files) - 1} more' if len(files) > 1 else ''}"
 
 
-def _warn_of_dark_frames(files: Sequence[Path]) -> Findings:
+def _warn_of_dark_frames(headers: Mapping[Path, Header]) -> Findings:
     """Warn of frames that are dark frames by their headers."""
+    files = [file for file, each in headers.items() if "dark" in each.image_type.value.lower()]
     if not files:
         return ()
     words = f"{_some(files)}: given as frames, but dark frames by their headers: {_QUOTE}"
@@ -202,12 +227,12 @@ def is_as_dark(frame: Array, dark: Array) -> bool:
 
 
 def _warn_of_settings(
-    named: str, dark: Settings, files: Sequence[Path], tolerance: float
+    named: str, dark: Settings, headers: Mapping[Path, Header], tolerance: float
 ) -> Findings:
     """Warn of files of another exposure time or temperature than their dark."""
     if dark == Settings():
         return ()
-    wanted = [(str(file), settings(file)) for file in files]
+    wanted = [(str(file), each.settings) for file, each in headers.items()]
     return say(*other_settings(named, dark, wanted, tolerance, _WORDS.several))
 
 
