@@ -155,6 +155,14 @@ def test_large_maps_are_reduced_in_parts(monkeypatch):
     np.testing.assert_array_equal(parts, whole)
 
 
+def test_maps_of_a_scene_have_its_gain_and_offset_in_dn(results):
+    method = results["scene"]
+    gain, offset = maps_of(method)
+    np.testing.assert_array_equal(gain.values, method.gain)
+    np.testing.assert_array_equal(offset.values, method.offset)
+    assert offset.unit == "DN"
+
+
 def test_maps_without_a_value_are_left_out(results):
     assert all(np.isfinite(each.values).any() for one in results.values() for each in maps_of(one))
 
