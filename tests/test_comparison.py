@@ -14,8 +14,8 @@ import pytest
 
 import equipix
 from equipix import cli, errors, simulate
-from equipix.comparison import Check, _verdict
-from equipix.metrics.correctability import student_quantile
+from equipix.comparison import Check, _freedom, _verdict
+from equipix.metrics.correctability import fisher_quantile, student_quantile
 from equipix.pictures import draw_comparison
 from equipix.report import page as report_page
 from equipix.report.figures import rows_of
@@ -397,15 +397,88 @@ def test_error_bars_that_are_inexact_or_uneven_widen_the_limits(alike):
     assert ratio == pytest.approx(scatters[1] / scatters[0], rel=0.15)
 
 
-def test_a_pixel_far_out_is_no_tilt(alike):
+@pytest.mark.parametrize("used", [SMALL[1], 20])
+def test_the_tilt_in_error_bars_is_no_part_of_the_pixels(alike, used):
+    """Also where the pixels that are known span a part of the sensor alone."""
+    flags = np.zeros(SMALL, np.uint32)
+    flags[:, used:] = equipix.Flag.DO_NOT_USE
+    middle = np.array([SMALL[0] - 1, used - 1]) / 2  # of the known pixels
+    extent = (np.indices(SMALL) - middle[:, None, None]) / np.reshape(SMALL, (2, 1, 1))
+    tilt = np.array([3e-3, 4e-3])
+    was, now = [], []
+    for each in alike:
+        hidden = each.sensitivity * np.sqrt(np.tensordot(tilt**2, extent**2, 1))
+        known = dataclasses.replace(each, flags=each.flags | flags, drift=None)
+        was.append(dataclasses.replace(known, tilt_std=1e-9 * tilt))
+        std = np.hypot(each.sensitivity_std, hidden).astype(np.float32)
+        now.append(dataclasses.replace(known, sensitivity_std=std, tilt_std=tilt))
+    before, after = (equipix.compare(pair).checks[0][0].predicted for pair in (was, now))
+    # Rounding of error bars in float32, whose squares are some ten times as large.
+    assert after == pytest.approx(before, rel=1e-5)
+
+
+def with_exactness(calibration, exactness, share=1.0):
+    """A calibration whose error bars are exact to this, and scaled."""
+    return dataclasses.replace(
+        calibration,
+        sensitivity_std=(calibration.sensitivity_std * share).astype(np.float32),
+        metadata={
+            **calibration.metadata,
+            "uncertainty": {"relative_standard_error": exactness},
+        },
+    )
+
+
+@pytest.mark.parametrize("wide", [0, 1])
+def test_the_exactness_of_wider_error_bars_counts_for_more(alike, wide):
+    """By their shares of the variance of the difference; nine of ten are of bars thrice as wide."""
+    pair = [
+        with_exactness(each, 0.2 if k == wide else 1e-3, 3.0 if k == wide else 1.0)
+        for k, each in enumerate(alike)
+    ]
+    shares = np.square([np.nanmean(each.sensitivity_std / each.sensitivity) for each in pair])
+    common = float(shares @ [0.2 if k == wide else 1e-3 for k in range(2)] / shares.sum())
+    freedom = 0.5 / common**2
+    # The degrees of freedom of the map, of thousands of pixels, add 1/100 to those of the bars.
+    high = fisher_quantile(1 - 0.0025 / 2, 1e9, freedom) ** 0.5
+    assert equipix.compare(pair).checks[0][0].high == pytest.approx(high, rel=0.02)
+
+
+def test_two_drifts_have_the_quantile_of_the_fewer_degrees_of_freedom(alike):
+    pair = [
+        dataclasses.replace(
+            each, drift=dataclasses.replace(each.drift, size=1e-9, degrees_of_freedom=freedom)
+        )
+        for each, freedom in zip(alike, (6, 2), strict=True)
+    ]
+    for order in (pair, pair[::-1]):
+        for check in equipix.compare(order).checks[0][1:3]:
+            assert check.high == pytest.approx(student_quantile(1 - 0.01 / 3 / 2, 2), rel=1e-9)
+
+
+def test_block_means_are_exact_to_their_number_unless_they_are_predicted(alike):
+    """Those of 16 blocks have 16 degrees of freedom, those that a caller gives count as exact."""
+    high, exact = (
+        equipix.compare(alike, predicted=given).checks[0][-1].high
+        for given in (None, [(1e-3, 1e-4)] * 2)
+    )
+    freedom = _freedom(alike, np.ones(2), without_tilt=False, side=16)
+    for found, beside in ((high, 16), (exact, 1e9)):
+        wanted = fisher_quantile(1 - 0.0025, freedom, beside) ** 0.5
+        # Pairs have nearly equal variances, of which the freedom of both depends weakly.
+        assert found == pytest.approx(wanted, rel=0.05)
+    assert high > 1.2 * exact
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_pixel_far_out_in_one_of_the_two_is_no_tilt(alike, number):
     """M at a corner three times as large counts for no slope of ln M."""
-    first, second = alike
-    sensitivity = first.sensitivity.copy()
+    sensitivity, changed = alike[number].sensitivity.copy(), list(alike)
     sensitivity[0, 0] *= 3
-    changed = dataclasses.replace(first, sensitivity=sensitivity)
+    changed[number] = dataclasses.replace(alike[number], sensitivity=sensitivity)
     for was, now in zip(
         equipix.compare(alike).checks[0][1:3],
-        equipix.compare([changed, second]).checks[0][1:3],
+        equipix.compare(changed).checks[0][1:3],
         strict=True,
     ):
         # A corner's weight is 6/3072, and its noise 8e-4.

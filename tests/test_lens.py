@@ -82,6 +82,25 @@ class TestFit:
         rms = np.sqrt(np.mean(np.square(z), axis=0))
         np.testing.assert_allclose(rms, 1, atol=4 / np.sqrt(2 * 40))
 
+    def test_standard_errors_of_a_radial_law_are_those_of_its_derivatives(self):
+        """Each of its own coefficient: they differ, and both are known from the law."""
+        shape, (row, col), (k1, k2) = (64, 64), (30.0, 35.0), (-0.4, 0.1)
+        half = np.hypot(*shape) / 2
+        rows, cols = (each.ravel() for each in np.indices(shape))
+        rho = ((rows - row) ** 2 + (cols - col) ** 2) / half**2
+        slope = 1000 * (k1 + 2 * k2 * rho) * -2 / half**2
+        light = 1 + k1 * rho + k2 * rho**2
+        moved = slope * (rows - row), slope * (cols - col)
+        design = np.stack([light, *moved, 1000 * rho, 1000 * rho**2], axis=1)
+        wanted = 10 * np.sqrt(np.diag(np.linalg.inv(design.T @ design)))
+        noise = 10 * np.random.default_rng(8).standard_normal(light.size)
+        found = lens.fit((1000 * light + noise).reshape(shape), law="radial")
+        assert wanted[4] > 1.15 * wanted[3]
+        # Of the spread of 4096 residuals, and of the centre, by which the derivatives move.
+        rel = 5 / np.sqrt(2 * light.size)
+        assert found.std["k1"] == pytest.approx(wanted[3], rel=rel)
+        assert found.std["k2"] == pytest.approx(wanted[4], rel=rel)
+
     def test_the_sensors_own_gain_can_be_given(self):
         sensitivity = simulate.cosine_sensitivity(SHAPE, rng=3)
         biased = lens.fit(1000 * cos4(squared(), FOCAL) * sensitivity)

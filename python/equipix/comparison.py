@@ -194,8 +194,8 @@ def compare(
     compared = sensitivities
     if is_open.any():
         compared = np.stack([_levelled(each, sensitivities[0]) for each in sensitivities])
-    given = None if predicted is None else _told(predicted, count)
-    reasons = [_not_judged(each, told=given is not None) for each in calibrations]
+    given = None if predicted is None else _checked_prediction(predicted, count)
+    reasons = [_not_judged(each, is_given=given is not None) for each in calibrations]
     expected = np.full((count, 2), np.nan)
     for k in (k for k, reason in enumerate(reasons) if not reason):
         expected[k] = _expected(calibrations[k]) if given is None else given[k]
@@ -207,7 +207,7 @@ def compare(
             sensitivities[pair],
             differences[number],
             np.square(expected[pair]),
-            told=given is not None,
+            is_given=given is not None,
         )
         for number, pair in enumerate(pairs)
     )
@@ -238,37 +238,38 @@ def _verdict(checks: tuple[Check, ...], reasons: Sequence[str] = ()) -> str:
         ("agree better than their noise", [c for c in checks if not c.passed]),
     ):
         if failed:
-            told = (
+            ratios = (
                 f"{c.what} {c.times:.3g} times as predicted (limits {c.low:.3g} to {c.high:.3g})"
                 for c in failed
             )
-            return f"{words}: {', '.join(told)}"
+            return f"{words}: {', '.join(ratios)}"
     return "agree within their noise"
 
 
 def _checks(
-    pair: Sequence[Calibration], maps: Array, difference: Array, variances: Array, *, told: bool
+    pair: Sequence[Calibration], maps: Array, difference: Array, variances: Array, *, is_given: bool
 ) -> tuple[Check, ...]:
     """Judge a pair by the rule of `compare`.
 
-    `variances` are those expected of each in pixels and in block means, `told` by the caller.
+    `variances` are those expected of each in pixels and in block means; `is_given` where the caller
+    predicted them.
     """
     drifts = [c.drift.degrees_of_freedom for c in pair if c.drift is not None and c.drift.is_added]
     tilts = np.square([np.zeros(2) if c.tilt_std is None else c.tilt_std for c in pair])
-    pixels = difference if told else _difference(maps[0], maps[1], True)
+    pixels = difference if is_given else _difference(maps[0], maps[1], True)
     count = [slope_pixels(each.sensitivity, each.flags) for each in pair]
     slopes = np.abs(tilt(maps[0] / maps[1], np.isfinite(pixels) & count[0] & count[1]))
     judged = np.flatnonzero((np.isfinite(tilts) & (tilts > 0)).all(axis=0) & np.isfinite(slopes))
     blocks = bool(np.isfinite(variances[:, 1]).all()) and not drifts
     tail = _FALSE / (1 + len(judged) + blocks)
     evenness, exactness, predicted = 1.0, _EXACT, variances[:, 0]
-    if not told:
+    if not is_given:
         predicted, exactness, evenness = _of_bars(pair, np.isfinite(pixels))
-    found = evenness * _freedom(pair, predicted, without_tilt=not told)
+    found = evenness * _freedom(pair, predicted, without_tilt=not is_given)
     low, high = (
         fisher_quantile(p, found, 0.5 / exactness**2) ** 0.5 for p in (tail / 2, 1 - tail / 2)
     )
-    what = "pixels, rms" if told else "pixels without tilt, rms"
+    what = "pixels, rms" if is_given else "pixels without tilt, rms"
     limits = [(what, rms(pixels), float(predicted.sum()), low, high)]
     high = student_quantile(1 - tail / 2, min(drifts, default=0))
     for axis in judged:
@@ -277,7 +278,9 @@ def _checks(
     if blocks:
         means = rms(block_means(difference))
         found = _freedom(pair, variances[:, 1], without_tilt=False, side=BLOCK)
-        high = fisher_quantile(1 - tail, found, 0.5 / _EXACT**2 if told else _MOST_BLOCKS) ** 0.5
+        high = (
+            fisher_quantile(1 - tail, found, 0.5 / _EXACT**2 if is_given else _MOST_BLOCKS) ** 0.5
+        )
         limits.append(("16×16 means, rms", means, float(variances[:, 1].sum()), 0.0, high))
     solver = sum(each.error_estimate**2 for each in pair)
     return tuple(
@@ -377,11 +380,11 @@ def _in_one_gauge(calibrations: Sequence[Calibration]) -> Array:
     return np.asarray(maps / np.nanmean(maps, axis=(1, 2), keepdims=True))
 
 
-def _not_judged(calibration: Calibration, *, told: bool) -> str:
-    """Why nothing can be predicted with a calibration, or what is `told` not used; empty if not."""
+def _not_judged(calibration: Calibration, *, is_given: bool) -> str:
+    """Why nothing can be predicted with a calibration, or why a given value is not used; empty if neither."""
     if not np.isfinite(calibration.error_estimate):
         return "the solver of {} failed"
-    if told:
+    if is_given:
         return ""
     if calibration.sensitivity_std is None:
         return "{} has no standard deviations (calibrate with --uncertainty)"
@@ -418,7 +421,7 @@ def _some_blocks(calibration: Calibration) -> Array:
     return np.array(weights)
 
 
-def _told(predicted: ArrayLike, count: int) -> Array:
+def _checked_prediction(predicted: ArrayLike, count: int) -> Array:
     """Errors that a caller predicts in pixels and in blocks, checked."""
     errors = as_array("predicted", predicted, ndim=2).astype(np.float64)
     check_count("predicted", len(errors), count)

@@ -13,7 +13,7 @@ import pytest
 
 import equipix
 from equipix import Flag, bolometer, errors, metrics, simulate
-from equipix.bolometer.state_fit import references_of, response_of
+from equipix.bolometer.state_fit import flags_of, references_of, response_of
 from equipix.report.maps import maps_of
 from equipix.saved_results import load_correction
 from equipix.simulate import BolometerArray
@@ -415,6 +415,22 @@ def test_the_noise_of_a_response_is_that_of_both_black_bodies():
     # Of 320 sample variances of 7 degrees of freedom.
     np.testing.assert_allclose(variance, wanted, rtol=5 * np.sqrt(2 / 320 / 7))
     assert response.var() == pytest.approx(wanted, rel=5 * np.sqrt(2 / 640) * np.sqrt(2))
+
+
+@pytest.mark.parametrize(("count", "is_dead"), [(1, False), (16, True)])
+def test_a_response_is_known_to_the_error_of_the_mean_of_the_states(count, is_dead):
+    """A pixel three standard errors of one state below half is dead by six of 16 states."""
+    sigma = 1.0
+    step = sigma * np.array([1, -1])[:, None, None]  # the variance of the mean of two is sigma²
+    error = np.sqrt(2) * sigma / 1000
+    response = np.ones(SHAPE)
+    response[5, 6] = 0.5 - 3 * error
+    levels = (1000 + 0 * response, 1000 + 0 * response, 1000 + 1000 * response)
+    shutter, *bodies = (
+        references_of("reference", [equipix.average(level + step)] * count) for level in levels
+    )
+    flags = flags_of(shutter, bodies, None)
+    np.testing.assert_array_equal(np.argwhere(flags), [[5, 6]] if is_dead else np.empty((0, 2)))
 
 
 class TestBodiesOfOtherStates:

@@ -758,6 +758,12 @@ class TestPlan:
         assert (status, err) == (0, "")
         assert json.loads(out)["patterns"][0]["components"] == 1
 
+    def test_a_pattern_has_its_own_number_of_exposures(self, run):
+        given = ("plan", "--shape", 64, 80, "--shifts", self.CROSS, "--exposures", 7)
+        status, _, err = run(*given)
+        assert status == 1
+        assert "'--exposures' is 7, but a pattern given by '--shifts' has its own: leave one" in err
+
     @pytest.mark.parametrize("shifts", ["0,0 0,0 0,1", "0,0 0,5 0,7", "0,0 0,5.3 0,7.8"])
     def test_what_a_line_of_shifts_leaves_open_is_said(self, run, shifts):
         command = ("plan", "--shape", 50, 50, "--shifts", shifts)

@@ -18,6 +18,7 @@ import reference
 from equipix import Flag, Polynomial, errors, hardware, metrics, nuc
 from equipix.findings import Finding, usable
 from equipix.hardware.table import UPLOAD
+from equipix.hardware.words import Words
 from equipix.io.tiff import write_frames
 from equipix.simulate import StaringArray
 
@@ -278,6 +279,22 @@ def test_the_function_of_the_c_header_gives_the_same_words(made, tmp_path, optio
     assert np.array_equal(np.frombuffer(done.stdout, np.uint16), table.apply(words).ravel())
 
 
+def test_the_function_of_the_c_header_rounds_a_sum_of_half_a_step_to_even(tmp_path):
+    """With an output of two steps of the sum each second sum is half-way between two words."""
+    gain, offset = np.full((4, 5), 1.5), np.arange(-10.0, 10.0).reshape(4, 5) / 2
+    steps = {"gain_step": 0.5, "offset_step": 0.5, "out_step": 1.0}
+    table = hardware.Table.of(polynomial(offset, gain), adc_bits=8, dac_bits=0, **steps)
+    assert table.format.shifts[2] == 1
+    table.save(tmp_path / "table.h")
+    program = compiled(tmp_path, FILTER.format(name="table", upper="TABLE"))
+    words = np.arange(256, dtype=np.uint16)[:, None, None] + np.zeros((4, 5), np.uint16)
+    done = subprocess.run([program], input=words.tobytes(), capture_output=True, check=True)
+    wanted = np.clip(np.rint(offset + gain * words), 0, None) - table.format.zero
+    found = np.frombuffer(done.stdout, np.uint16).reshape(words.shape)
+    np.testing.assert_array_equal(found, wanted)
+    np.testing.assert_array_equal(table.apply(words), wanted)
+
+
 def included(folder, names):
     """Compile a program that includes headers, and calls the function of each."""
     calls = " + ".join(f"equipix_{c_name}_apply(0, 0)" for c_name in names.values())
@@ -516,6 +533,41 @@ def test_a_far_offset_is_named(made):
     flags[4, 5] |= Flag.DO_NOT_USE
     without = hardware.Table.of(Polynomial(planes, flags))
     assert without.metadata["largest_error_dn"] == exact
+
+
+@pytest.mark.parametrize(("count", "refused"), [(3, True), (4, True), (5, False)])
+def test_far_offsets_are_few_up_to_a_hundredth_of_the_usable_pixels(count, refused):
+    """More of them are a part of the array."""
+    shape = (20, 25)
+    offset, flags = np.zeros(shape), np.zeros(shape, np.uint32)
+    offset[0, :count] = 3e5
+    flags[16:] = Flag.DO_NOT_USE  # 400 are left
+    correction = polynomial(offset, 1.0, flags=flags, shape=shape)
+    if refused:
+        with pytest.raises(errors.InputError, match=f"without the {count} offsets far from most"):
+            hardware.Table.of(correction)
+    else:
+        hardware.Table.of(correction)
+
+
+def test_a_far_offset_may_cost_a_step_of_the_output():
+    """Words of 8 bits from one offset to the other have steps of 2 DN, or of 4 DN."""
+    options = {"dac_bits": 0, "offset_bits": 8, "out_step": 1.0}
+    offset = np.tile([0.0, 1.0], (10, 10))
+    offset[4, 4] = 300.0
+    table = hardware.Table.of(polynomial(offset, 1.0, shape=offset.shape), **options)
+    assert (table.format.offset, table.metadata["largest_error_dn"]) == (1, 1.0)
+    with pytest.raises(errors.InputError, match=r"the largest error 2 DN, without the 1 "):
+        hardware.Table.of(polynomial(2 * offset, 1.0, shape=offset.shape), **options)
+
+
+@pytest.mark.parametrize("dtype", [np.int8, np.int16])
+def test_words_of_offsets_are_the_numbers_of_twos_complement(dtype):
+    ends, words = np.iinfo(dtype), Words("offset", np.iinfo(dtype).bits, signed=True)
+    inside = np.array([ends.min, -1, 0, ends.max], float)
+    assert words.outside(inside, 0) == 0
+    np.testing.assert_array_equal(words.encoded(inside, 0).astype(dtype), inside)
+    assert words.outside(np.array([ends.min - 1.0, ends.max + 1.0]), 0) == 2
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
@@ -834,6 +886,22 @@ def test_the_smallest_width_is_the_first_that_suffices():
     assert found.offset_bits == 8
     with pytest.raises(errors.InputError, match="gain_bits"):
         hardware.smallest_widths(response, docs.frames_of(array), gain_bits=9)
+
+
+def test_where_no_width_suffices_the_worst_place_is_that_of_16_bits(made):
+    """Gains of 8 bits do not fit this step at all, so that no level is worse than another."""
+    array, response = made
+    levels = [np.stack(list(array.frames(light, 8, rng=3))) for light in (8.5e6, 3e6)]
+    options = {"gain_step": 2.0**-12, "lowest": 1000.0}
+    found = hardware.smallest_widths(response, levels, added=1e-12, **options)
+    costs = [
+        hardware.quality(response, each, gain_bits=16, offset_bits=16, **options).added
+        for each in levels
+    ]
+    assert found.gain_bits is None
+    assert np.isinf(found.added["gain"][8])
+    assert found.added["gain"][16] == max(costs)
+    assert found.worst["gain"] == (costs.index(max(costs)), "") == (1, "")
 
 
 def test_findings_of_a_table_and_of_its_frames_are_shown(made, tmp_path, run):

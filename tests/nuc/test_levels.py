@@ -328,6 +328,14 @@ class TestDefectsAndQuality:
         assert told["percentiles_of_K"] == pytest.approx(wanted.gain_percentiles)
         np.testing.assert_array_equal(equipix.load(output).flags, response.flags | wanted.flags)
 
+    def test_frames_are_not_replaced_by_the_flags_found_in_them(self, run, saved, folder):
+        raw = folder / "level2.tif"
+        content = raw.read_bytes()
+        status, _, err = run("nuc", "defects", saved[1], raw, "-o", raw, "--force")
+        assert status == 1
+        assert "level2.tif: is one of the inputs: name another output" in err
+        assert raw.read_bytes() == content
+
     def test_filters_are_a_key_of_the_file(self, run, tmp_path):
         """Of the three commands `defects` and `quality` alone have an option for them."""
         colour, text = np.tile([[1.0, 2.0], [2.0, 3.0]], (16, 20)), ""

@@ -11,6 +11,8 @@ import equipix
 import reference
 from equipix import Flag, NoiseModel, errors, nuc
 from equipix.measured.means import Averaged
+from equipix.nuc.levels import levels_of
+from equipix.nuc.order import next_power
 from equipix.simulate import StaringArray
 
 SHAPE = (48, 64)
@@ -239,6 +241,33 @@ class TestOrder:
         prediction = response.metadata["options"]["prediction_errors"]
         assert len(prediction) == 4
         assert min(prediction) == prediction[order]
+
+    @pytest.mark.parametrize("count", [3, 4, 5, 6])
+    def test_auto_tries_each_order_that_the_levels_left_determine(self, count):
+        """With one left out, as many levels as coefficients: no further than the cubic."""
+        order = min(3, count - 2)
+        levels = curves(truth(order, np.random.default_rng(1)), np.linspace(300, 3500, count))
+        response = nuc.fit(levels, order="auto")
+        assert response.order == order
+        assert len(response.metadata["options"]["prediction_errors"]) == order + 1
+
+    def test_prediction_errors_are_in_variances_of_the_level_left_out(self):
+        """Of the true order 1 for each such level, and x Cᵀ x of the others beside it."""
+        rng, places = np.random.default_rng(16), np.linspace(300, 3500, 5)
+        variances = np.array([1.0, 100.0, 4.0, 25.0, 1.0])
+        noise = np.sqrt(variances)[:, None, None] * rng.standard_normal((5, *SHAPE))
+        levels = curves(truth(1, rng), places) + noise
+        found = nuc.fit(levels, order="auto", variance=variances)
+        wanted = []
+        for held in (1, 2, 3):
+            others = np.delete(np.arange(5), held)
+            design = np.vander(places, 2, increasing=True)
+            scaled = design[others] / np.sqrt(variances[others])[:, None]
+            covariance = np.linalg.inv(scaled.T @ scaled)
+            wanted.append(1 + design[held] @ covariance @ design[held] / variances[held])
+        # Five standard errors of the mean of 3072 squares; those of a pixel are not independent.
+        error = found.metadata["options"]["prediction_errors"][1]
+        assert error == pytest.approx(np.mean(wanted), rel=5 * np.sqrt(2 / 3072))
 
     def test_auto_takes_the_lowest_order_that_exact_levels_have(self):
         response = nuc.fit(curves(truth(1, np.random.default_rng(1))), order="auto")
@@ -503,6 +532,11 @@ class TestRefusals:
             assert all("is -30" in str(each.message) for each in told)
             assert all("DN at level 1. Give" in str(each.message) for each in told)
 
+    def test_the_noise_that_levels_do_not_exceed_is_the_median(self):
+        level = 100 + 0.1 * np.random.default_rng(1).standard_normal(SHAPE)
+        with pytest.raises(errors.InputError, match="1 of 3 differ by .* mean, 2 DN, but order 1"):
+            nuc.fit([level, level, level], order=1, variance=np.array([1.0, 4.0, 900.0]))
+
     def test_levels_that_saturate(self, levels):
         clipped = np.minimum(np.rint(levels), 3100).astype(np.uint16)
         message = r"'levels': 1.2% .*expected 50% .*Level 7 has no value in 98.8%"
@@ -607,6 +641,16 @@ class TestRefusals:
     def test_a_gain_without_signal(self):
         with pytest.raises(errors.InputError, match="largest mean is -10 DN"):
             nuc.fit(np.full((1, *SHAPE), -10.0), order=0, by="gain")
+
+    @pytest.mark.parametrize("sigma", [0.1, 2.0])
+    def test_a_gain_needs_a_level_above_six_standard_deviations(self, sigma):
+        even = 0.01 * sigma * np.random.default_rng(1).standard_normal((2, *SHAPE))
+        dim, light = sigma * (even + np.array([5.9, 6.1])[:, None, None])
+        variance = np.full(2, sigma**2)
+        with pytest.raises(errors.InputError, match="which is no signal"):
+            nuc.fit([dim], order=0, by="gain", variance=variance[:1])
+        nuc.fit([light], order=0, by="gain", variance=variance[:1])
+        nuc.fit([dim, light], order=0, by="gain", variance=variance)  # one with signal is enough
 
 
 class TestRawAverages:
@@ -718,6 +762,22 @@ class TestMisfit:
         with pytest.warns(errors.MisfitWarning, match="order 2 explains no more") as found:
             nuc.fit(levels, variance=NoiseModel(read_noise=1.0, gain=0.0625))
         assert "order=" not in str(found[0].message)
+
+    def test_a_tenth_of_bent_pixels_does_not_bend_the_others(self):
+        """V̄ bends with them, so that all others have a curvature in common."""
+        rng = np.random.default_rng(26)
+        noise = 5 * rng.standard_normal((len(LEVELS), *SHAPE))
+        exact = truth(1, rng)
+        flat = nuc.fit(curves(exact) + noise, order=2, variance=np.full(len(LEVELS), 25.0))
+        bent = rng.permutation(exact[0].size).reshape(SHAPE) % 10 == 0
+        deviation = np.concatenate([exact, np.zeros((1, *SHAPE))])
+        deviation[2, bent] = 50 * np.sqrt(flat.variances[-1].mean())
+        levels = levels_of(curves(deviation) + noise, variance=np.full(len(LEVELS), 25.0))
+        # The median is then 5 standard deviations off 0, where the mean is. It lies at the quantile
+        # 0.5/0.9 of the others, 0.14 standard deviations from their middle, and so does that of the
+        # squares: 1.31 times that of noise.
+        found = next_power(levels, 1, workers=1)
+        assert found["ratio"] == pytest.approx(1.31, abs=5 * found["standard_error"])
 
     @pytest.mark.study
     @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")

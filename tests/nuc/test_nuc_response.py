@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import json
 import pickle
 import warnings
@@ -14,7 +15,8 @@ import equipix
 from equipix import Flag, cli, errors, metrics, nuc, simulate
 from equipix.io.frames import read_frames, stream_frames
 from equipix.io.tiff import write_frames
-from equipix.nuc.response import pattern_variance
+from equipix.measured.noise import median_of_noise
+from equipix.nuc.response import common_misfit, pattern_variance, typical
 from records import rewrite
 
 SHAPE = (24, 32)
@@ -79,6 +81,128 @@ def test_the_pattern_that_noise_leaves_is_predicted():
     assert np.isnan(pattern_variance(by_gain, 5000.0))
     colours = nuc.fit(levels, order=2, cfa="RGGB")
     assert np.isnan(pattern_variance(colours, 5000.0))
+
+
+def made(dark=60.0, order=3, count=5):
+    """A response of levels whose dark was subtracted, as arrays without noise; its levels."""
+    rng, levels = np.random.default_rng(3), np.linspace(200.0, 3000.0, count)
+    sizes = (5.0, 0.05, 5e-6, 5e-10)
+    planes = [size * rng.uniform(-1, 1, SHAPE) for size in sizes[: order + 1]]
+    planes = [each - each.mean() for each in planes]  # then the mean of the array is v
+    values = [v + sum(q * v**i for i, q in enumerate(planes)) for v in levels]
+    found = nuc.fit(values, order=order, variance=np.full(count, 4.0))
+    return dataclasses.replace(found, dark=np.full(SHAPE, dark), findings=()), values
+
+
+@pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")  # no noise
+class TestRange:
+    def test_it_has_its_ends_and_lies_above_a_stored_dark(self):
+        response, _ = made()
+        low, high = response.valid_range + 60.0
+        assert not response.extrapolated(np.stack([low, high])).any()
+        assert response.extrapolated(np.nextafter(low, 0.0)).all()
+        assert response.extrapolated(np.nextafter(high, np.inf)).all()
+
+    def test_the_exact_inverse_is_of_frames_less_the_stored_dark(self):
+        response, values = made()
+        for value in values:
+            found = response.correct(value + 60.0, exact=True)
+            # All pixels saw one light: rounding of a fit of four powers scaled to [−1, 1].
+            np.testing.assert_allclose(found, found.flat[0], rtol=1e-10)
+        shifted, _ = made(dark=100.0)
+        np.testing.assert_allclose(
+            shifted.correct(values[2] + 100.0, exact=True),
+            response.correct(values[2] + 60.0, exact=True),
+            rtol=1e-10,
+        )
+
+    def test_a_curve_without_an_inverse_has_no_exact_value(self):
+        response, values = made()
+        inverse = response.inverse.copy()
+        inverse[:, 2, 3] = np.nan
+        changed = dataclasses.replace(response, inverse=inverse)
+        found = changed.correct(values[2] + 60.0, exact=True, flagged="keep")
+        np.testing.assert_array_equal(np.argwhere(np.isnan(found)), [[2, 3]])
+
+    def test_the_largest_error_of_the_inverse_is_of_usable_pixels(self):
+        response, _ = made()
+        worst = np.unravel_index(response.inverse_error.argmax(), SHAPE)
+        flags = np.zeros(SHAPE, np.uint32)
+        flags[worst] = Flag.HOT | Flag.DO_NOT_USE
+        others = np.delete(response.inverse_error.ravel(), response.inverse_error.argmax())
+        assert response.largest_inverse_error == response.inverse_error.max()
+        assert response.with_flags(flags).largest_inverse_error == others.max()
+
+    def test_flags_given_again_stay(self):
+        response, _ = made()
+        flags = np.full(SHAPE, 2**32 - 1, np.uint64)
+        once = response.with_flags(flags)
+        np.testing.assert_array_equal(once.flags, flags)
+        np.testing.assert_array_equal(once.with_flags(flags).flags, flags)
+
+
+@pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")  # no noise
+class TestPatternVariance:
+    """With two levels and known variances it is a formula."""
+
+    LEVELS = np.array([500.0, 2500.0])
+    VARIANCES = np.array([4.0, 25.0])
+
+    def fitted(self, **options):
+        gain = 1 + 0.3 * np.linspace(-1, 1, 24 * 32).reshape(SHAPE)
+        values = self.LEVELS[:, None, None] * gain
+        return gain, nuc.fit(values, variance=self.VARIANCES, **options)
+
+    @pytest.mark.parametrize("level", [500.0, 1000.0, 2500.0, 4000.0])
+    def test_it_is_that_of_the_line_over_the_square_of_the_slope(self, level):
+        gain, response = self.fitted()
+        share = (level - 500) / 2000
+        variance = (1 - share) ** 2 * 4 + share**2 * 25
+        wanted = np.mean(variance / gain**2)
+        # Rounding of the inverse of a 2×2 matrix whose columns are alike to a fifth.
+        assert pattern_variance(response, level) == pytest.approx(wanted, rel=1e-9)
+
+    def test_pixels_without_a_value_at_some_level_do_not_count(self):
+        gain, response = self.fitted()
+        used = response.used.copy()
+        used[:, :16] = 1
+        response = dataclasses.replace(response, used=used)
+        wanted = np.mean(25 / gain[:, 16:] ** 2)
+        assert pattern_variance(response, 2500.0) == pytest.approx(wanted, rel=1e-9)
+
+    def test_one_point_by_offset_has_one_without_a_dark_alone(self):
+        _, response = self.fitted(order=0)
+        # The weighted mean of both levels, at any level.
+        wanted = pytest.approx(1 / (1 / 4 + 1 / 25), rel=1e-9)
+        assert [pattern_variance(response, at) for at in (0.0, 3000.0)] == [wanted] * 2
+        with_dark = dataclasses.replace(response, dark=np.zeros(SHAPE))
+        assert np.isnan(pattern_variance(with_dark, 3000.0))
+
+
+@pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")  # no noise
+class TestTypical:
+    @pytest.mark.parametrize("freedom", [1, 2, 6])
+    def test_it_is_one_of_noise_of_any_freedom(self, freedom):
+        count = 20_000
+        squares = np.random.default_rng(freedom).chisquare(freedom, count) / freedom
+        found = typical(squares, np.full(count, freedom))
+        # Five standard errors of the median, which are largest for one degree of freedom.
+        assert found == pytest.approx(1, abs=5 * 2.33 / np.sqrt(count))
+
+    def test_it_is_no_more_than_the_mean(self):
+        """Of few different values the median may be any."""
+        assert typical(np.array([1.0, 1.0, 1.0, 0.0, 0.0]), np.array(1)) == 0.6
+
+    def test_usable_pixels_with_freedom_alone_have_a_misfit_in_common(self):
+        response, _ = made(order=1)
+        # The median of a third below, a third at and a third above is that of noise.
+        chi2 = np.tile(np.repeat([0.9, 1.0, 5.0], 4), (SHAPE[0], 1)) * median_of_noise(np.array(3))
+        chi2, used = np.hstack([np.zeros((SHAPE[0], 20)), chi2]), response.used.copy()
+        flags = np.zeros(SHAPE, np.uint32)
+        flags[:, :10], used[:, 10:20] = Flag.HOT | Flag.DO_NOT_USE, 2
+        chi2[:, :20] = 50.0
+        odd = dataclasses.replace(response, reduced_chi2=chi2, used=used, flags=flags)
+        assert common_misfit(odd) == pytest.approx(1, rel=1e-12)
 
 
 class TestFile:

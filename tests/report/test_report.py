@@ -10,6 +10,7 @@ import json
 import os
 import re
 import tomllib
+import warnings
 from enum import Flag
 from html.parser import HTMLParser
 
@@ -18,7 +19,7 @@ import pytest
 from report_results import SHAPE, calibration, every_kind, measured
 
 import equipix
-from equipix import detector, hardware, lens, metrics, nuc, plan, simulate
+from equipix import detector, hardware, lens, metrics, nuc, plan, scene, simulate
 from equipix.errors import FileError
 from equipix.pictures import new_figure
 from equipix.report import camera
@@ -154,6 +155,20 @@ def test_large_maps_are_reduced_in_parts(monkeypatch):
     monkeypatch.setattr("equipix.report.maps._AT_ONCE", 60 * 7)
     parts, _ = Map("it", "", values).reduced(20)
     np.testing.assert_array_equal(parts, whole)
+
+
+def test_maps_of_a_scene_have_its_gain_and_offset_in_dn():
+    method = scene.LocalMean(SHAPE, (1000.0, 5000.0))
+    rng = np.random.default_rng(1)
+    pattern = 20 * rng.standard_normal(SHAPE)
+    with warnings.catch_warnings(action="ignore"):  # nothing moves in these frames
+        for light in rng.uniform(2000, 4000, 20):
+            method.update(light + pattern + 300 * rng.standard_normal(SHAPE))
+    assert np.std(method.offset) > 1
+    gain, offset = maps_of(method)
+    np.testing.assert_array_equal(gain.values, method.gain)
+    np.testing.assert_array_equal(offset.values, method.offset)
+    assert offset.unit == "DN"
 
 
 def test_maps_without_a_value_are_left_out(results):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,9 +13,11 @@ import tifffile
 
 import equipix
 from equipix import scene
+from equipix.cli.scene import _summary
 from equipix.io.frames import read_frames
 from equipix.io.tiff import write_frames
 from equipix.scene.methods import METHODS
+from equipix.scene.sequence import SequenceResult
 from equipix.simulate import MovingScene
 
 SHAPE = (48, 64)
@@ -102,6 +105,17 @@ def test_a_floor_that_is_not_known_is_said_in_words(run, recorded, tmp_path):
     options = ("--method", "local-mean", "--force")
     assert re.search(r"\nfloor of the pattern +not determined\n", run(*command, *options)[1])
     assert json.loads(run(*command, *options, "--json")[1])["floor_dn"] is None
+
+
+@pytest.mark.parametrize("count", [1, 2, 10, 11, 19, 20, 21, 100])
+def test_at_most_ten_points_of_the_quality_are_printed(count):
+    """The first and the last are among them."""
+    points = tuple(range(1, count + 1))
+    done = SequenceResult(count, points, (0.1,) * count, (0.1,) * count, np.zeros(SHAPE), ())
+    method = scene.LocalMean(SHAPE, (0.0, 1.0))
+    shown = [each["frame"] for each in _summary(Path("nuc.tif"), method, done)["roughness"]]
+    assert (shown[0], shown[-1]) == (1, count)
+    assert len(shown) == len({*shown}) <= 10
 
 
 def test_the_picture_is_drawn_and_the_table_printed(run, recorded, tmp_path):

@@ -310,7 +310,6 @@ def flags_of(shutter: Measured, bodies: Sequence[Measured], mask: ArrayLike | No
         mean = np.where(good, response.mean(axis=0), np.nan)
         error = 0.0 if variance is None else float(np.sqrt(variance.sum())) / len(variance)
         dead, hot = response_outliers(mean, lambda: np.full(mean.shape, error))
-        good &= ~(dead | hot)
     if not good.any():
         raise InputError(
             "'shutter' has no pixel with a value at every state below saturation, expected some"

@@ -16,7 +16,7 @@ from equipix.correction.protocol import Correction, check_sensor, named_cfa
 from equipix.experiment.level_experiment import LevelExperiment
 from equipix.findings import Findings
 from equipix.io.formats import SAVED, SUFFIXES
-from equipix.io.paths import refuse_inputs
+from equipix.io.paths import find_files, refuse_inputs
 from equipix.io.record import read_record
 from equipix.measured.colour import Colours
 from equipix.measured.defects import SIGMAS, DefectLimits
@@ -92,6 +92,7 @@ def defects(
 ) -> None:
     """Find bad pixels by response curves and by frames of one level."""
     terminal.check_output(output, [response], force=force, suffixes=SUFFIXES)
+    refuse_inputs(terminal.given(output), find_files(frames) if frames else [])
     limits = DefectLimits(**{name.removesuffix("_limit"): each for name, each in options.items()})
     curves = read_record(response, Response)
     check_sensor(curves, sensor)

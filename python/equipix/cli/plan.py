@@ -55,6 +55,11 @@ def plan(
         raise InputError(
             "give either '--shifts', to evaluate a pattern, or '--max-shift', to find patterns"
         )
+    if shifts is not None and exposures is not None:
+        raise InputError(
+            f"'--exposures' is {exposures}, but a pattern given by '--shifts' has its own: leave "
+            "one out"
+        )
     said: Findings = ()
     if causes["shift_error"] and causes["beam_width"] is None:
         words = "'--shift-error' has no effect in an even beam: give '--beam-width' for another"

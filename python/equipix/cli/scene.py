@@ -149,8 +149,9 @@ def _method(
 
 def _summary(output: Path, method: SceneCorrection, done: SequenceResult) -> dict[str, Any]:
     """Frames, spreads of the coefficients, and quality over time."""
-    every = max(1, -(-len(done.points) // _SHOWN))
-    points = [*range(0, len(done.points) - 1, every), len(done.points) - 1]
+    last = len(done.points) - 1
+    every = max(1, -(-last // (_SHOWN - 1)))
+    points = [*range(0, last, every), last]
     return {
         "output": str(output),
         "frames": done.frames,

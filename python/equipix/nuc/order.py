@@ -68,23 +68,26 @@ def chosen_order(levels: Levels, by: By, *, workers: int | None) -> tuple[int, l
 
     Notes
     -----
-    Up to four levels between the lowest and the highest are left out, one at a time. The error is
-    the difference of the left-out level to the fit of the others at its reference, in standard
-    deviations of the level where noise is known, mean square over usable pixels and levels. The
-    lowest order within 0.1 % of the smallest error is taken.
+    Up to four levels between the lowest and the highest are left out, one at a time. Where only
+    three differ, all levels are: at the mean of two others orders 0 and 1 predict the same. The
+    error is the difference of the left-out level to the fit of the others at its reference, in
+    standard deviations of the level where noise is known, mean square over usable pixels and
+    levels. The lowest order within 0.1 % of the smallest error is taken.
 
     A pixel that deviates from the others at some order counts at none, nor in V̄: its mean square is
     above 36 times the variance of the normal variable whose square has the median of the array.
     These are the same pixels for all orders, and one in twenty at most: more are a part of the
     array, which the order must fit.
     """
-    between = np.argsort(levels.references)[1:-1]
     highest = min(3, levels.distinct() - 2)
     if highest < 1:
         raise InputError(
             f"'order' is 'auto', which leaves out one of the levels between the lowest and the "
             f"highest, but {levels.distinct()} of {len(levels)} differ: give three, or an order"
         )
+    between = np.argsort(levels.references)
+    if highest > 1:
+        between = between[1:-1]
     places = np.unique(np.linspace(0, len(between) - 1, HELD).round().astype(int))
     held, orders = between[places], range(highest + 1)
     squares = np.stack([_squares(levels, held, order, by, workers) for order in orders])

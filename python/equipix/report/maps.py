@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 
@@ -174,9 +174,8 @@ def _of_statistics(frames: FrameStatistics) -> Iterator[Map]:
 
 
 def _of_scene(correction: SceneCorrection) -> Iterator[Map]:
-    low, high = cast("tuple[float, float]", correction.data_range)
     yield Map("Gain", "", correction.gain)
-    yield Map("Offset", "DN", correction.offset * (high - low), "deviation")
+    yield Map("Offset", "DN", correction.offset, "deviation")
 
 
 def _of_correction(correction: Correction) -> Iterator[Map]:
