@@ -381,7 +381,7 @@ def _in_one_gauge(calibrations: Sequence[Calibration]) -> Array:
 
 
 def _not_judged(calibration: Calibration, *, is_given: bool) -> str:
-    """Why nothing can be predicted with a calibration, or why a given value is not used; empty if neither."""
+    """Why nothing is judged with a calibration; empty if nothing stands against it."""
     if not np.isfinite(calibration.error_estimate):
         return "the solver of {} failed"
     if is_given:
