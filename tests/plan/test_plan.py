@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import equipix
 import reference
-from equipix import metrics, plan, simulate
+from equipix import _native, metrics, plan, simulate
 from equipix.errors import (
     IdentifiabilityWarning,
     InputError,
@@ -126,6 +126,35 @@ class TestIdentify:
     )
     def test_known_patterns(self, shifts, components):
         assert plan.identify((150, 170), shifts).components == components
+
+    @settings(max_examples=150, deadline=None)
+    @given(st.data())
+    def test_a_part_of_a_sensor_tells_of_the_whole(self, data):
+        """A mask that leaves all pixels has the whole sensor looked at."""
+        spans = data.draw(st.tuples(st.integers(0, 7), st.integers(0, 7)), "spans")
+        place = st.tuples(*(st.integers(0, span) for span in spans))
+        shifts = data.draw(st.lists(place, min_size=2, max_size=5), "shifts")
+        cfa = data.draw(st.sampled_from([None, "RGGB", "RGB/", "RRGG/GGBB"]))
+        shape = tuple(data.draw(st.integers(1, 40), "more") + 5 * span for span in spans)
+        part, whole = (
+            plan.identify(shape, shifts, mask, cfa=cfa) for mask in (None, np.zeros(shape, bool))
+        )
+        for name in ("components", "largest", "equations", "unknowns", "by_colour"):
+            assert getattr(part, name) == getattr(whole, name), name
+        np.testing.assert_array_equal(part.labels, whole.labels)
+
+    @pytest.mark.parametrize(
+        "shifts", [CROSS, equipix.cross_pattern(4, 6), [(0, 0), (7, 3), (2, 9)]]
+    )
+    def test_takes_no_more_memory_for_a_larger_sensor(self, monkeypatch, shifts):
+        looked_at, find = [], _native.planned_components
+        monkeypatch.setattr(
+            _native, "planned_components", lambda *a, **b: looked_at.append(a[0]) or find(*a, **b)
+        )
+        found = plan.identify((20_000, 30_000), shifts)
+        assert found.equations == len(shifts) * 600_000_000
+        # Three spans of 19 pixels, and up to two periods of the lattice: 57 of the last one.
+        assert np.max(looked_at) <= 3 * 19 + 2 + 2 * 57
 
     def test_what_calibrate_finds(self):
         mask = np.random.default_rng(3).random((5, 30, 40)) < 0.4

@@ -1,5 +1,6 @@
 """The command plan: errors of a pattern of shifts, and better patterns."""
 
+import math
 from dataclasses import replace
 from typing import Annotated, Any
 
@@ -103,7 +104,7 @@ def _plan_summary(budget: ErrorBudget, cfa: str | None) -> dict[str, Any]:
         "shifts": budget.shifts.tolist(),
         "components": budget.components,
         **({} if found.by_colour is None else {"components_by_colour": found.by_colour}),
-        "largest": found.largest if budget.components == found.components else found.labels.size,
+        "largest": found.largest if budget.components == found.components else math.prod(budget.shape),
         "equations": found.equations,
         "unknowns": found.unknowns,
         "rms": budget.rms,
