@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tracemalloc
 import warnings
+from itertools import product
 
 import numpy as np
 import pytest
@@ -18,8 +20,9 @@ from equipix.errors import (
     InputWarning,
     MisfitWarning,
 )
+from equipix.plan import pattern_errors
 from equipix.plan.drift import distinct_trend, tilt_of_fluxes, tilt_rms
-from equipix.plan.pattern_errors import local_variance
+from equipix.plan.pattern_errors import LocalVariance
 
 WITHIN = 0.1
 """The claim: predictions agree with simulation within 10 %."""
@@ -502,14 +505,69 @@ class TestBudget:
             weight = powers**2 * np.exp(-2 * away / (width or 1) ** 2)
             counts = np.array([seen[tuple(cell)] for cell in cells.tolist()])
             wanted[p] = 1 / (weight.sum() - np.sum(powers**2 * weight / counts))
-        found = np.concatenate(list(local_variance(shape, positions, powers, width)))
+        found = LocalVariance(shape, positions, powers, width).at(*map(np.arange, shape))
         # Sums of seven terms of one sign, but for a difference of some tenths of them.
         np.testing.assert_allclose(found, wanted, rtol=1e-12)
+
+    @pytest.mark.parametrize("width", [None, 150.0])
+    @pytest.mark.parametrize("shape", [(200, 300), (7, 190), (45, 12)])
+    def test_the_mean_of_the_local_variance_is_that_of_all_pixels(self, shape, width):
+        rng = np.random.default_rng(4)
+        positions, powers = rng.integers(0, 7, (5, 2)), rng.uniform(0.5, 1.5, 5)
+        local = LocalVariance(shape, positions, powers, width)
+        # The beam is analytic: 32 nodes leave rounding, of sums over 60 000 pixels.
+        wanted = np.mean(local.at(*map(np.arange, shape)))
+        assert local.mean == pytest.approx(wanted, rel=6e4 * np.finfo(float).eps)
+
+    def test_the_map_and_parts_of_it(self):
+        budget = budget_of((150, 40), CROSS, noise=1e-3, beam_width=90)
+        assert budget.noise_map.shape == (150, 40)
+        rows, cols = np.array([3, 70, 149]), np.array([0, 39])
+        np.testing.assert_array_equal(budget.noise_at(rows, cols), budget.noise_map[rows][:, cols])
+        rms = np.sqrt(np.mean(budget.noise_map**2))
+        assert budget.rms_by_cause["noise"] == pytest.approx(rms, rel=6e3 * np.finfo(float).eps)
+
+    # Of a strip the ends count as on 16 spans of its length, which is too much where shifts are
+    # nearly periodic.
+    @pytest.mark.study
+    @pytest.mark.parametrize(
+        ("name", "spans"),
+        [
+            *product((*PATTERNS, "far"), [(3, 3), (4, 5), (8, 6), (16, 16)]),
+            *product(("long arms", "corners", "nine", "far"), [(1.5, 24)]),
+        ],
+    )
+    def test_the_noise_of_a_large_sensor_follows_from_a_part(self, monkeypatch, name, spans):
+        far = np.random.default_rng(4).integers(0, 25, (6, 2))
+        positions = far if name == "far" else np.array(PATTERNS[name][1])
+        shape = tuple((spans * np.ptp(positions, axis=0)).astype(int).tolist())
+        monkeypatch.setattr(pattern_errors, "_PIXELS", 800_000)
+        monkeypatch.setattr(pattern_errors, "_MOST", 120)
+        monkeypatch.setattr(pattern_errors, "_SMALLEST", 16)
+        by_law = pattern_errors.factor(shape, positions, np.ones(len(positions)))
+        monkeypatch.setattr(pattern_errors, "_SMALLEST", 1000)
+        drawn = pattern_errors.factor(shape, positions, np.ones(len(positions)))
+        assert np.sqrt(by_law) == pytest.approx(np.sqrt(drawn), rel=WITHIN)
 
     def test_a_large_sensor_takes_no_longer_to_solve(self):
         small, large = (budget_of((size, size), CROSS, noise=1).rms for size in (256, 2000))
         # Edges matter less: their share falls from 19/256 to nothing.
         assert small * (1 - 0.05) < large < small
+
+    def test_150_megapixels_take_the_memory_of_a_small_sensor(self):
+        tracemalloc.start()
+        try:
+            budget = budget_of((10240, 14648), CROSS, noise=1, beam_width=20_000)
+            peak = tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+        # A map of the errors would take 1.2 GB.
+        assert peak < 100e6
+        # Without edges: the root of the mean of 1/λ, in a beam that falls to 0.82 at the corners.
+        rows, cols = (2 * np.pi * (np.arange(1000) + 0.5) / 1000 for _ in range(2))
+        inverse = 1 / pattern_errors.symbol(rows, cols, CROSS, np.ones(5))
+        even = np.sqrt(inverse.mean())
+        assert even < budget.rms < even / 0.82
 
     @pytest.mark.parametrize(
         ("options", "words"),
