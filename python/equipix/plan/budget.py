@@ -284,7 +284,7 @@ def _on_drift(budget: ErrorBudget) -> str | None:
     return (
         f"lamp drift will tilt the sensitivity by {drift:.1e} rms, {drift / noise:.1f} times the "
         "error by noise, and leaves no residual: measure the flux, turn one exposure, or use "
-        "larger shifts (equipix.plan.suggest)"
+        "larger shifts of more exposures (equipix.plan.suggest)"
     )
 
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from math import ceil
+from math import ceil, lgamma
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
@@ -281,6 +281,11 @@ def _basis(places: Floats, low: Floats, extent: Floats) -> Floats:
 _FINER = 64
 """Steps within one of the grid of frequencies, to each side, that the smallest λ is refined by."""
 
+_PASSES, _PASSES_OF_A_WAVE, _WEAK, _WEAKEST = 20, 0.55, 0.2, 1e-4
+"""Products without weak waves, and of each weak wave with λ/n a quarter of that of `_WEAK`; λ/n
+below which a wave is weak, and one that is as good as undetermined. Fitted to 102 patterns of five
+to nine positions at 391×291 and 782×582, 19 to 955 products: the rms deviation is a fifth."""
+
 _FREQUENCIES = 512
 """Between 0 and half a cycle per pixel: finer than the dips of patterns up to this many pixels."""
 
@@ -303,6 +308,9 @@ class Spectrum:
         phase is about the same in all exposures. NaN if all waves are long.
     smallest : float
         λ there.
+    passes : float
+        Products with the data that `calibrate` is expected to take for such shifts, whatever the
+        size of the sensor: within a factor of two. Between pixels it only compares patterns.
     """
 
     rows: Floats
@@ -310,6 +318,7 @@ class Spectrum:
     values: Array
     worst: tuple[float, float]
     smallest: float
+    passes: float
 
     def __repr__(self) -> str:
         """Short form: the worst wave."""
@@ -346,10 +355,49 @@ def spectrum(shifts: Array, powers: Floats) -> Spectrum:
     )
     short = np.where(scatter < 1, np.inf, values)
     row, col = np.unravel_index(short.argmin(), short.shape)
+    passes = _passes(short / np.sum(powers**2))
     if np.isinf(short[row, col]):
-        return Spectrum(rows, cols, values, (np.nan, np.nan), np.nan)
+        return Spectrum(rows, cols, values, (np.nan, np.nan), np.nan, passes)
     worst = float(rows[row]), float(cols[col])
-    return Spectrum(rows, cols, values, worst, float(values[row, col]))
+    return Spectrum(rows, cols, values, worst, float(values[row, col]), passes)
+
+
+def _passes(short: Floats) -> float:
+    """Predict the products of conjugate gradients from λ/n of all waves but long ones.
+
+    Each wave with a local minimum of λ leaves an eigenvalue, or some, below those of all others:
+    the deeper it is, the more products it takes.
+    """
+    # Beyond its edges the spectrum goes on: it repeats, and is the same for q and −q.
+    around = np.concatenate([short[1:2, ::-1], short, short[-2:-1, ::-1]])
+    around = np.concatenate([around[:, -2:-1], around, around[:, 1:2]], axis=1)
+    lowest = np.minimum(np.minimum(around[:-2], around[1:-1]), around[2:])
+    lowest = np.minimum(np.minimum(lowest[:, :-2], lowest[:, 1:-1]), lowest[:, 2:])
+    rows, cols = np.nonzero((short == lowest) & (short < _WEAK))
+    # The last column is the first. Of the first and last row each wave is there twice.
+    counts = np.where(cols == short.shape[1] - 1, 0, np.where(rows % _FREQUENCIES == 0, 0.5, 1))
+    depths = np.sqrt(_WEAK / np.maximum(short[rows, cols], _WEAKEST)) - 1
+    return float(_PASSES + _PASSES_OF_A_WAVE * np.sum(counts * depths))
+
+
+def usual_passes(patterns: Array) -> Floats:
+    """Predict the products for patterns (..., n, 2), as if their positions were chosen at random.
+
+    The phases of a wave at the positions are then independent, and the waves with λ/n < t are
+    those within a ball of n − 1 dimensions: their share is c·t^((n − 1)/2). Around each minimum λ₀
+    it is (t − λ₀) / (4π √det Σ), with Σ the covariance of the positions. So the depths of `_passes`
+    add up to π √det Σ · c · (n − 1)/(n − 4) · t^((n − 3)/2) at t = `_WEAK`. Of fewer than five
+    positions the deepest minima decide: they count as five.
+    """
+    count = max(patterns.shape[-2], 5)
+    half = (count - 1) / 2
+    share = half * np.log(count / (4 * np.pi)) - lgamma(half + 1) + np.log(count) / 2
+    of_spread = np.pi * np.exp(share + (half - 1) * np.log(_WEAK)) * (count - 1) / (count - 4)
+    away = patterns - patterns.mean(axis=-2, keepdims=True)
+    covariances = np.swapaxes(away, -1, -2) @ away / patterns.shape[-2]
+    # Of positions on a line rounding may leave less than 0.
+    spread = np.sqrt(np.maximum(np.linalg.det(covariances), 0))
+    return np.asarray(_PASSES + _PASSES_OF_A_WAVE * of_spread * spread)
 
 
 def smallest_near(found: Spectrum, shifts: Array) -> float:
