@@ -18,6 +18,7 @@ import cargo
 import large
 import multiscale
 import numpy as np
+import planning
 import reporting
 import response
 import subpixel
@@ -45,6 +46,7 @@ def main(*, smoke: bool) -> None:
     rows += subpixel.rows((48, 64), repetitions=1) if smoke else subpixel.rows()
     rows += experiment.rows((96, 128), frames=2, repetitions=1) if smoke else experiment.rows()
     rows += large.rows((96, 128)) if smoke else large.rows()
+    rows += planning.rows((96, 128), travel=20) if smoke else planning.rows()
     rows += reporting.rows((96, 128)) if smoke else reporting.rows()
     rows += averaging.rows(frames=3, repetitions=1) if smoke else averaging.rows()
     rows += response.rows(shape=(24, 32), repetitions=1) if smoke else response.rows()

@@ -1,16 +1,14 @@
 """Draw plan.png, three patterns of shifts and their errors: ``python docs/plan.py``.
 
 The cross of the paper and what `equipix.plan.suggest` finds for the same sensor and a stage that
-travels 80 pixels, with 5 and with 9 exposures. Printed: how much better they are, how long the
-search took, and how long `identify` takes at 150 megapixels, with its memory.
+travels 80 pixels, with 5 and with 9 exposures. Printed: how much better they are, and how long the
+search took.
 """
 
 from __future__ import annotations
 
-import re
 import time
 import warnings
-from pathlib import Path
 
 from figures import FOLDER, SAVED
 
@@ -21,22 +19,10 @@ from equipix.pictures import draw_plans
 
 SENSOR, TRAVEL = (582, 782), 80
 CAUSES = {"noise": 5.8e-4, "drift": 3e-5, "shift_error": 0.01, "beam_width": 1000}
-LARGE = (10240, 14648)
-
-
-def identify_large() -> None:
-    """Print seconds and peak memory of `identify` at 150 megapixels and 5 exposures."""
-    start = time.perf_counter()
-    found = plan.identify(LARGE, equipix.cross_pattern(11, 19))
-    seconds = time.perf_counter() - start
-    status = Path("/proc/self/status").read_text()
-    peak = 1024 * int(re.findall(r"VmHWM:\s+(\d+)", status)[0])
-    print(f"{found}: {seconds:.1f} s, at most {peak / 1e9:.1f} GB")
 
 
 def main() -> None:
     """Measure, print and draw."""
-    identify_large()
     cross = plan.error_budget(SENSOR, equipix.cross_pattern(11, 19), **CAUSES)
     budgets = [cross]
     for exposures in (5, 9):

@@ -22,7 +22,7 @@ SIGNAL, READ_NOISE = 16_000, 10
 PATTERNS = {
     5: equipix.cross_pattern(11, 19),
     # From: equipix plan --shape 582 782 --exposures 9 --max-shift 30 30
-    9: [(29, 0), (3, 30), (0, 0), (29, 30), (0, 29), (0, 30), (30, 0), (30, 30), (1, 0)],
+    9: [(0, 29), (30, 0), (30, 30), (29, 0), (0, 30), (0, 0), (28, 30), (1, 0), (30, 29)],
 }
 """Shifts (row, col) in pixels, by the number of exposures."""
 

@@ -270,7 +270,7 @@ def draw_plans(budgets: list[ErrorBudget]) -> Figure:
     """
     figure = new_figure(15, 3.6 * len(budgets))
     rows = figure.subplots(len(budgets), 4, squeeze=False, width_ratios=(1, 1.5, 1.3, 0.9))
-    shown = [_thinned(budget.noise_map) for budget in budgets]
+    shown = [_thinned_noise(budget) for budget in budgets]
     finite = np.concatenate([values[np.isfinite(values)] for values, _ in shown])
     limits = (float(finite.min()), float(finite.max()))
     largest = max(max(b.rms_by_cause.values()) for b in budgets if np.isfinite(b.rms))
@@ -283,10 +283,11 @@ def draw_plans(budgets: list[ErrorBudget]) -> Figure:
     return figure
 
 
-def _thinned(image: Array) -> tuple[Array, int]:
-    """Leave out rows and columns of a map that no picture could show."""
-    step = max(1, max(image.shape) // 1000)
-    return image[::step, ::step], step
+def _thinned_noise(budget: ErrorBudget) -> tuple[Array, int]:
+    """Return the map of errors by noise without rows and columns that no picture could show."""
+    step = max(1, max(budget.shape) // 1000)
+    rows, cols = (np.arange(0, size, step) for size in budget.shape)
+    return budget.noise_at(rows, cols), step
 
 
 def _positions(axes: Axes, budget: ErrorBudget) -> None:

@@ -729,8 +729,24 @@ class TestPlan:
     def test_finds_patterns(self, run):
         status, out, _ = run("plan", "--shape", 64, 80, "--max-shift", 9, 9, "--drift", 0, "--json")
         assert status == 0
-        found = json.loads(out)["patterns"]
+        result = json.loads(out)
+        found = result["patterns"]
         assert {(len(plan["shifts"]), plan["components"]) for plan in found} == {(5, 1)}
+        six, seven = result["more_exposures"]
+        assert (six["exposures"], seven["exposures"]) == (6, 7)
+        assert found[0]["rms"] > six["rms"] > seven["rms"]
+        assert all(each["expected_passes"] > 0 for each in (*found, six, seven))
+
+    @pytest.mark.parametrize(("exposures", "more"), [(4, 2), (6, 1), (7, 0)])
+    def test_says_what_more_positions_gain(self, run, exposures, more):
+        command = ("plan", "--shape", 64, 80, "--exposures", exposures, "--drift", 1e-6)
+        status, out, err = run(*command, "--max-shift", 9, 9)
+        assert (status, err) == (0, "")
+        assert re.search(r"expected passes +\d+", out)
+        gains = re.findall(
+            r"^with (\d) positions: \S+ of all causes, \d+ passes$", out, re.MULTILINE
+        )
+        assert gains == ["6", "7"][2 - more :]
 
     def test_judges_each_pattern_that_it_finds(self, run):
         status, out, err = run("plan", "--shape", 300, 400, "--max-shift", 9, 9)

@@ -1,12 +1,16 @@
 """The command plan: errors of a pattern of shifts, and better patterns."""
 
+import math
+import warnings
+from contextlib import suppress
 from dataclasses import replace
 from typing import Annotated, Any
 
 import typer
 
+from equipix._check import Progress
 from equipix.cli import terminal
-from equipix.errors import InputError
+from equipix.errors import EquipixWarning, InputError
 from equipix.exposures.positions import whole_moves
 from equipix.findings import Finding, Findings, say
 from equipix.pictures import check_picture, draw_plans, save_figure
@@ -61,6 +65,7 @@ def plan(
             "one out"
         )
     said: Findings = ()
+    more: list[ErrorBudget] = []
     if causes["shift_error"] and causes["beam_width"] is None:
         words = "'--shift-error' has no effect in an even beam: give '--beam-width' for another"
         said = say(Finding("unused", words, "input", "note"))
@@ -71,10 +76,10 @@ def plan(
             causes["drift"] = causes["noise"] / 10
         budgets = [error_budget(shape, _pairs(shifts), **causes)]
     elif max_shift is not None:
+        causes |= {"cfa": cfa, "rng": rng}
         with terminal.working() as (progress, _):
-            found = suggest(
-                shape, exposures, max_shift, cfa=cfa, rng=rng, progress=progress, **causes
-            )
+            found = suggest(shape, exposures, max_shift, progress=progress, **causes)
+            more = _with_more(shape, len(found[0].shifts), max_shift, progress, causes)
         budgets = [suggestion.budget for suggestion in found]
     if output is not None:
         save_figure(draw_plans(budgets), output, force=force)
@@ -82,10 +87,43 @@ def plan(
     plans = [_plan_summary(budget, cfa) for budget in budgets]
     if as_json:
         result = {"picture": output and str(output), "shape": list(shape), "patterns": plans}
+        if max_shift is not None:
+            result["more_exposures"] = [_gain_summary(budget) for budget in more]
         every = dict.fromkeys(each for budget in budgets for each in budget.findings)
         terminal.show_result(result, tuple(every), as_json=True)
     else:
         _show_plans(plans)
+        for gain in map(_gain_summary, more):
+            words = (
+                "with {exposures} positions: {rms:.2e} of all causes, {expected_passes:.0f} passes"
+            )
+            print(words.format(**gain))  # noqa: T201
+
+
+def _with_more(
+    shape: tuple[int, int],
+    count: int,
+    max_shift: tuple[int, int],
+    progress: Progress | None,
+    options: dict[str, Any],
+) -> list[ErrorBudget]:
+    """Return the budgets of the best patterns of six and seven positions, if that is more.
+
+    Fewer where the travel is too small for a pattern of so many.
+    """
+    budgets = []
+    with warnings.catch_warnings(), suppress(InputError):
+        warnings.simplefilter("ignore", EquipixWarning)
+        for more in range(max(count + 1, 6), 8):
+            found = suggest(shape, more, max_shift, patterns=1, progress=progress, **options)
+            budgets.append(found[0].budget)
+    return budgets
+
+
+def _gain_summary(budget: ErrorBudget) -> dict[str, Any]:
+    """Collect what a pattern of more positions gives."""
+    passes = budget.spectrum.passes
+    return {"exposures": len(budget.shifts), "rms": budget.rms, "expected_passes": passes}
 
 
 def _pairs(text: str) -> list[list[float]]:
@@ -108,7 +146,9 @@ def _plan_summary(budget: ErrorBudget, cfa: str | None) -> dict[str, Any]:
         "shifts": budget.shifts.tolist(),
         "components": budget.components,
         **({} if found.by_colour is None else {"components_by_colour": found.by_colour}),
-        "largest": found.largest if budget.components == found.components else found.labels.size,
+        "largest": found.largest
+        if budget.components == found.components
+        else math.prod(budget.shape),
         "equations": found.equations,
         "unknowns": found.unknowns,
         "rms": budget.rms,
@@ -116,6 +156,7 @@ def _plan_summary(budget: ErrorBudget, cfa: str | None) -> dict[str, Any]:
         "tilt_by_cause": {name: list(tilt) for name, tilt in budget.tilt_by_cause.items()},
         "worst_wave": list(budget.spectrum.worst),
         "smallest_eigenvalue": budget.spectrum.smallest,
+        "expected_passes": budget.spectrum.passes,
         "distinct_trend": budget.distinct_trend,
         "order": order.tolist(),
         "distinct_trend_in_order": distinct_trend(budget.shifts[order]),
@@ -135,6 +176,7 @@ def _show_plans(plans: list[dict[str, Any]]) -> None:
         "equations / unknowns": lambda p: f"{p['equations']} / {p['unknowns']}",
         "worst wave, cycles per pixel": lambda p: "({:.3f}, {:.3f})".format(*p["worst_wave"]),
         "λ of it": lambda p: f"{p['smallest_eigenvalue']:.3f}",
+        "expected passes": lambda p: f"{p['expected_passes']:.0f}",
         "linear trend distinct from tilt": lambda p: f"{p['distinct_trend']:.1%}",
         "  in the order advised": lambda p: f"{p['distinct_trend_in_order']:.1%}",
     }

@@ -1,19 +1,18 @@
 """The error budget of a planned calibration: noise, lamp drift, errors of the shifts."""
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 
-from equipix._check import ArrayLike, Floats, Ints, as_shifts, check_shape, per_exposure, positive
+from equipix._check import ArrayLike, Floats, as_shifts, check_shape, per_exposure, positive
 from equipix.errors import InputError
 from equipix.exposures.positions import whole_moves
 from equipix.findings import Finding, Rule, ask, say
 from equipix.plan import pattern_errors
-from equipix.plan.components import identify, is_connected
+from equipix.plan.components import identify
 from equipix.plan.drift import distinct_trend, tilt_of_fluxes, tilt_rms
-from equipix.plan.pattern_errors import Spectrum
+from equipix.plan.pattern_errors import LocalVariance, Spectrum
 
 _WHOLE = 0.02
 """Largest fraction of a pixel at which shifts count as whole, as in `calibrate`'s warning."""
@@ -21,6 +20,12 @@ _WHOLE = 0.02
 _NOISY = 0.1
 """Error by noise, and light over that of other pixels, from which pixels are looked at one by one:
 beside one pixel in a hundred that is not determined the rms is larger."""
+
+_LOOKED_AT = 1000
+"""Rows and columns of a larger sensor that are looked at."""
+
+_BLOCK = 64
+"""Rows of the map at a time."""
 
 _UNDETERMINED = 1e-4
 """λ of a wave that shifts between pixels do not determine, as in a calibration's finding."""
@@ -65,7 +70,7 @@ class ErrorBudget:
     spectrum: Spectrum
     distinct_trend: float
     components: int
-    _variances: Callable[[], Iterable[Floats]]
+    _local: LocalVariance
     findings: tuple[Finding, ...] = ()
 
     def __repr__(self) -> str:
@@ -80,14 +85,14 @@ class ErrorBudget:
         By halves of the sensor it is within 10 % of simulation; within 25 % where a few long or
         nearly periodic waves make up most of the error, as with shifts of one pixel.
         """
-        return np.asarray(np.sqrt(np.concatenate(list(self._variances()))))
+        rows, cols = map(np.arange, self.shape)
+        starts = range(0, len(rows), _BLOCK)
+        return np.concatenate([self.noise_at(rows[i : i + _BLOCK], cols) for i in starts])
 
-
-def _rms(blocks: Iterable[Floats]) -> float:
-    """Root of the mean of variances over the pixels that are determined."""
-    sums = [(np.sum(each, where=np.isfinite(each)), np.isfinite(each).sum()) for each in blocks]
-    total, count = np.sum(sums, axis=0)
-    return float(np.sqrt(total / count)) if count else np.inf
+    def noise_at(self, rows: ArrayLike, cols: ArrayLike) -> Floats:
+        """Return the `noise_map` on a grid of some rows and columns, (rows, cols)."""
+        shape = self._local.at(np.asarray(rows), np.asarray(cols)) / self._local.mean
+        return self.rms_by_cause["noise"] * np.sqrt(shape)
 
 
 def error_budget(
@@ -147,10 +152,11 @@ def error_budget(
     -----
     With weights 1 and M = 1, noise σ leaves a covariance of :math:`\sigma^2 S^{-1}`, S being the
     matrix of the linear problem for M: its diagonal is approximated by paths of one step, which
-    include edges and the beam, and scaled to draws of noise that `calibrate` solves. It is within
-    some per cent. Drift: the part of ln c that is affine in d leaves no residual and becomes a
-    tilt, whose slope has the covariance (drift²/n)·cov(d)⁻¹. Errors of shifts: by least squares
-    over polynomials of degree 6. Weights are 1 throughout, as in `calibrate` without `variance`.
+    include edges and the beam, and scaled to draws of noise that `calibrate` solves, of a large
+    sensor on a part. It is within some per cent. Drift: the part of ln c that is affine in d leaves
+    no residual and becomes a tilt, whose slope has the covariance (drift²/n)·cov(d)⁻¹. Errors of
+    shifts: by least squares over polynomials of degree 6. Weights are 1 throughout, as in
+    `calibrate` without `variance`.
 
     Examples
     --------
@@ -171,15 +177,15 @@ def error_budget(
         raise InputError(f"'flux' is {powers.tolist()}, expected numbers above 0")
     positions = whole_moves(exact)
     waves = pattern_errors.spectrum(exact, powers)
-    components = _components(sizes, positions, _between_pixels(exact))
-    scale = noise**2 * pattern_errors.factor(sizes, positions, powers)
-    variances = partial(
-        pattern_errors.local_variance, sizes, positions, powers, beam_width, scale=scale
-    )
+    # Between pixels no part of the sensor is unconnected: each is compared with parts of cells.
+    parts = identify(sizes, positions).components
+    components = 1 if _between_pixels(exact) else parts
+    local = LocalVariance(sizes, positions, powers, beam_width)
+    by_noise = noise * np.sqrt(pattern_errors.factor(sizes, positions, powers) * local.mean)
     drifted = tilt_of_fluxes(sizes, exact, drift)
     along_rows, along_cols = drifted.tolist()
     moved, tilt = pattern_errors.shift_error_effect(sizes, exact, powers, beam_width, shift_error)
-    causes = {"noise": _rms(variances()), "drift": float(tilt_rms(drifted)), "shift_error": moved}
+    causes = {"noise": float(by_noise), "drift": float(tilt_rms(drifted)), "shift_error": moved}
     budget = ErrorBudget(
         shape=sizes,
         shifts=exact,
@@ -189,7 +195,7 @@ def error_budget(
         spectrum=waves,
         distinct_trend=distinct_trend(exact),
         components=components,
-        _variances=variances,
+        _local=local,
     )
     return replace(budget, findings=say(*ask(_RULES, budget)))
 
@@ -220,14 +226,6 @@ def _between_pixels(shifts: Floats) -> bool:
     """
     moves = shifts - shifts[0]
     return bool(np.abs(moves - np.rint(moves)).max() > _WHOLE)
-
-
-def _components(shape: tuple[int, int], positions: Ints, between: bool) -> int:
-    """Count the components."""
-    fits = np.all(np.abs(positions) < shape)
-    if fits and (between or is_connected(shape, positions)):
-        return 1
-    return identify(shape, positions).components
 
 
 def _on_wave(budget: ErrorBudget) -> str | None:
@@ -266,7 +264,8 @@ def _on_line(budget: ErrorBudget) -> str | None:
 
 def _on_beam(budget: ErrorBudget) -> str | None:
     """Say that the beam lights only a part of the sensor."""
-    noise = budget.noise_map if budget.rms_by_cause["noise"] > _NOISY else np.zeros(1)
+    rows, cols = (np.unique(np.linspace(0, n - 1, _LOOKED_AT).round()) for n in budget.shape)
+    noise = budget.noise_at(rows, cols) if budget.rms_by_cause["noise"] > _NOISY else np.zeros(1)
     share = np.mean((noise > max(1, noise.min() / _NOISY)) & np.isfinite(noise))
     width = np.ceil(np.hypot(*budget.shape) / 2 / np.log(1 / _NOISY) ** 0.5)
     words = (
@@ -285,7 +284,7 @@ def _on_drift(budget: ErrorBudget) -> str | None:
     return (
         f"lamp drift will tilt the sensitivity by {drift:.1e} rms, {drift / noise:.1f} times the "
         "error by noise, and leaves no residual: measure the flux, turn one exposure, or use "
-        "larger shifts (equipix.plan.suggest)"
+        "larger shifts of more exposures (equipix.plan.suggest)"
     )
 
 

@@ -14,6 +14,7 @@ from equipix.measured.colour import Colours
 from equipix.plan.budget import ErrorBudget, check_causes, error_budget
 from equipix.plan.components import is_connected
 from equipix.plan.drift import advise_order, tilt_of_fluxes, tilt_rms
+from equipix.plan.pattern_errors import spectrum, usual_passes
 
 Points = NDArray[np.int64]
 
@@ -42,6 +43,10 @@ _PERIODS = 8
 
 _PERIODIC = 0.02
 """λ of such a wave at which the predicted variance by noise counts twice."""
+
+_MOST_PASSES = 100
+"""Expected products above which a pattern counts as worse. Cross (11, 19) takes 32; of 72 patterns
+of five to seven positions that were found with this limit none took more than 102."""
 
 
 _PHASES, _MOVED, _ONE_STEP = 100, 0.5, 0.3
@@ -99,8 +104,8 @@ def suggest(
         Travel of the stage, in pixels, along both axes or (row, col): shifts are 0 to that. It is
         cut where the sensor is smaller.
     noise, drift, shift_error, beam_width : float
-        As for `error_budget`, whose `rms` is what makes a pattern good. Unless given, drift is a
-        tenth of the noise; for the order of the patterns only such ratios matter.
+        As for `error_budget`, whose `rms` and expected passes make a pattern good. Unless given,
+        drift is a tenth of the noise; for the order of the patterns only such ratios matter.
     patterns : int
         How many patterns to return, at most.
     cfa : str or array_like of labels, optional
@@ -114,7 +119,7 @@ def suggest(
     Returns
     -------
     list of Suggestion
-        The patterns, by rising error.
+        The patterns, by rising error; those that take too many passes last.
 
     Raises
     ------
@@ -134,6 +139,11 @@ def suggest(
     noise too. So good patterns have some positions a few pixels apart, at different distances, and
     others as far away as the travel allows. From several starts of this kind, positions are moved
     one by one to where the predicted error is least.
+
+    The farther five or six positions are apart, the more waves are barely constrained, and the more
+    products the solver takes (`budget.spectrum.passes`). Above 100 of them the error counts more,
+    by the square of their number: five positions then use a part of a large travel only. A sixth
+    or seventh position allows for a larger part of it.
 
     Examples
     --------
@@ -191,11 +201,19 @@ def suggest(
             budget = error_budget(sizes, shifts, drift=lamp, **causes)
             suggestions.append(Suggestion(shifts, budget))
             report(done, len(finalists), "judging patterns")
-    suggestions.sort(key=lambda suggestion: suggestion.budget.rms)
+    suggestions.sort(key=_weighed_error)
     for number, suggestion in enumerate(suggestions[:wanted], start=1):
         found_of = suggestion.budget.findings
         say(*(replace(each, message=f"pattern {number}: {each.message}") for each in found_of))
     return suggestions[:wanted]
+
+
+def weighed(error: ArrayLike, passes: ArrayLike) -> Floats:
+    """Error that counts in a comparison of patterns: more where the solver takes too long.
+
+    The tilt by drift falls with the spread of the positions, and the passes rise with its square.
+    """
+    return np.asarray(error * np.maximum(1, np.asarray(passes) / _MOST_PASSES) ** 2)
 
 
 def _travel(max_shift: ArrayLike, shape: tuple[int, int]) -> Points:
@@ -205,6 +223,11 @@ def _travel(max_shift: ArrayLike, shape: tuple[int, int]) -> Points:
         raise InputError(f"'max_shift' is {max_shift!r}, expected pixels from 0 on, or (row, col)")
     travel = np.minimum(np.broadcast_to(values, 2), np.array(shape) - 1)
     return np.asarray(travel.astype(np.int64))
+
+
+def _weighed_error(suggestion: Suggestion) -> float:
+    budget = suggestion.budget
+    return float(weighed(budget.rms, budget.spectrum.passes))
 
 
 class _Score:
@@ -248,7 +271,7 @@ class _Score:
             inverse *= 1 + _PERIODIC / visible[_WAVES:].min(axis=0)
         noise = self._noise**2 * inverse * (1 - 1 / count) * rest
         drift = tilt_rms(tilt_of_fluxes(self.shape, patterns, self._drift))
-        return np.asarray(np.sqrt(noise + drift**2))
+        return weighed(np.sqrt(noise + drift**2), usual_passes(patterns))
 
     def _waves(self, places: Points) -> NDArray[np.complex64]:
         down, right = self._phases
@@ -343,9 +366,14 @@ def _whole_score(points: Points, score: _Score) -> float:
 
 
 def _distinct(found: list[Points], score: _Score) -> list[Points]:
-    """Sort patterns by their scores, without those that are others moved as a whole."""
+    """Sort patterns by errors and passes, without those that are others moved as a whole."""
     patterns: dict[tuple[Any, ...], Points] = {}
     for points in found:
         moved = points - points.min(axis=0)
         patterns.setdefault(tuple(sorted(map(tuple, moved.tolist()))), points)
-    return sorted(patterns.values(), key=lambda points: _whole_score(points, score))
+
+    def key(points: Points) -> float:
+        passes = spectrum(points, np.ones(len(points))).passes
+        return float(weighed(_whole_score(points, score), passes))
+
+    return sorted(patterns.values(), key=key)
