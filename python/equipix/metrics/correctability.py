@@ -217,7 +217,7 @@ def student_quantile(probability: float, freedom: int) -> float:
     if not freedom:
         return NormalDist().inv_cdf(probability)
     # With t = √f tan θ the density of θ is cos^(f − 1) θ.
-    angles = np.linspace(0, np.pi / 2, 100_001)
+    angles = np.linspace(0, np.pi / 2, 10_001)
     density = np.cos(angles) ** (freedom - 1)
     area = np.concatenate([[0], np.cumsum(density[1:] + density[:-1])])
     angle = np.interp(2 * probability - 1, area / area[-1], angles)
