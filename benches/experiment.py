@@ -11,7 +11,7 @@ import numpy as np
 
 import equipix
 from equipix import demo
-from equipix.experiment.aperture import measured_shifts
+from equipix.experiment.aperture import measured_moves
 from equipix.experiment.image_files import sha256_of
 from equipix.experiment.manifest import entry_files as find_files
 
@@ -29,7 +29,7 @@ def rows(
         virtual = demo.virtual_experiment(shape, frames=frames, bit_depth=12, rng=1)
         experiment = equipix.Experiment.load(virtual.write(Path(scratch) / "experiment"))
         averages = averaged(experiment)
-        shifts = np.rint(measured_shifts(experiment.path, experiment.manifest)[0])
+        shifts = np.rint(measured_moves(experiment.path, experiment.manifest).shifts)
         parts: list[Callable[[], object]] = [
             experiment.run,
             lambda: reading(experiment),
@@ -66,7 +66,7 @@ def reading(experiment: equipix.Experiment) -> None:
     averaged(experiment)
     sha256_of([experiment.path, *experiment.files()])
     for _ in range(2):
-        measured_shifts(experiment.path, experiment.manifest)
+        measured_moves(experiment.path, experiment.manifest)
 
 
 def timed(part: Callable[[], object]) -> float:

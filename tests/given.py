@@ -13,6 +13,7 @@ from equipix.exposures.exposures import Exposures
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Positions
 from equipix.io.tiff import write_frames
+from equipix.measured.colour import Colours
 from equipix.measured.measured import measured_of
 from equipix.scene.methods import METHODS
 from equipix.scene.scene_correction import SceneCorrection
@@ -34,10 +35,11 @@ def exposures_of(
     time: Any = None,
     rotation: Any = None,
     shift_std: Any = None,
+    cfa: Any = None,
     **options: Any,
 ) -> Exposures:
     """Make exposures; the arguments are those of `equipix.calibrate`."""
-    measured = measured_of(frames, variance, saturation)
+    measured = measured_of(frames, variance, saturation, colours=Colours.of(cfa))
     shape = measured.values.shape
     positions = Positions.of(shifts, rotation=rotation, std=shift_std, shape=shape)
     return Exposures.of(

@@ -10,7 +10,7 @@ import pytest
 import equipix
 from equipix import simulate
 from equipix.errors import InputError
-from equipix.experiment.aperture import Equalisation
+from equipix.experiment.aperture import Equalisation, Moves, region_of_spots
 from equipix.exposures.exposures import FitOptions
 from equipix.exposures.spots import Spot
 from equipix.findings import Flag
@@ -125,3 +125,48 @@ def test_pixels_are_not_taken_for_worse_than_before_a_calibration():
     edge = 4 * np.pi * LARGEST
     below = around(np.full(SHAPE, 0.99 * edge)).unequal_pixels(spot(20, 20))
     assert below == pytest.approx(0.99 * LARGEST)
+
+
+def moves_of(spots, shifts=CROSS):
+    """Moves with spots at these places."""
+    return Moves(np.array(shifts, float), np.zeros((len(shifts), 2)), np.array(spots, float))
+
+
+def test_a_region_holds_all_spots_far_from_its_edges_unless_the_sensor_ends():
+    spots = [(700.2, 900.8), (711.9, 881.1)]
+    rows, cols = region_of_spots(moves_of(spots), (1600, 2400), (2, 3))
+    # A sixteenth of the side, of the columns more than 128; whole periods from the corner on.
+    assert (rows.start, rows.stop) == (572, 840)
+    assert (cols.start, cols.stop) == (729, 1051)
+    assert rows.start % 2 == cols.start % 3 == 0
+    near = region_of_spots(moves_of([(20, 30), (2390, 40)]), (2400, 2400), (1, 1))
+    assert (near[0].start, near[0].stop, near[1].start) == (0, 2400, 0)
+
+
+def test_far_moves_take_a_larger_region_and_most_of_a_sensor_is_all_of_it():
+    far = moves_of([(700, 900)], [(0, 0), (0, 210)])
+    rows, cols = region_of_spots(far, (1600, 2400), (1, 1))
+    # Twice the largest move on every side.
+    assert (rows.start, rows.stop, cols.start, cols.stop) == (280, 1121, 480, 1321)
+    middle = moves_of([(500, 500)], [(0, 0), (0, 210)])
+    assert region_of_spots(middle, (1000, 1000), (1, 1)) is None
+    assert region_of_spots(moves_of([(120, 160)]), (240, 320), (1, 1)) is None
+
+
+def test_maps_of_a_part_correct_the_same_pixels():
+    """And a spot is as uncertain there as by maps of the whole sensor."""
+    weighted, flags = fitted(), np.zeros(SHAPE, np.uint32)
+    darks = [np.full(SHAPE, 7.0), np.arange(2000.0).reshape(SHAPE)]
+    whole = Equalisation.of(weighted, flags, darks=darks)
+    part = dataclasses.replace(
+        whole,
+        corner=(8, 10),
+        **{name: getattr(whole, name)[8:38, 10:46] for name in ("gain", "dark", "variance")},
+    )
+    images = np.random.default_rng(2).uniform(100, 200, (2, *SHAPE))
+    for exposure in (0, 1):
+        ours, wanted = (each.at(exposure).apply(images) for each in (part, whole))
+        np.testing.assert_array_equal(ours, wanted[:, 8:38, 10:46])
+    assert part.unequal_pixels(spot(20, 25)) == whole.unequal_pixels(spot(20, 25))
+    with pytest.raises(InputError, match=r"of a sensor of \(40, 50\), .* have \(40, 49\)"):
+        part.apply(images[:, :, 1:])

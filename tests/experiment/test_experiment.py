@@ -11,6 +11,7 @@ import pytest
 
 from equipix import Experiment, Flag, FrameStatistics, errors, load, metrics, simulate
 from equipix.experiment import experiment as experiment_run
+from equipix.fitting.weighted import weighted_fit
 from equipix.io.frames import read_frames
 from equipix.measured.defects import dead_pixels, hot_pixels
 from equipix.measured.means import Averaged
@@ -118,9 +119,38 @@ def test_measured_shifts_are_the_stage_s(manifest, virtual):
     np.testing.assert_allclose(shifts, virtual.truth.shifts, atol=0.1)
 
 
+def test_moves_are_measured_again_with_a_part_of_the_sensor(tmp_path, monkeypatch):
+    """As well as with all of it: both leave the noise of the images."""
+    truth = simulate.paper_sensitivity((400, 420), rng=1)
+    beam = simulate.gaussian_beam(truth.shape, width=300)
+    virtual = simulate.experiment(truth, beam, SHIFTS, frames=8, aperture_frames=8, rng=2)
+    experiment, fitted, found = Experiment.load(virtual.write(tmp_path / "it")), [], {}
+
+    def fit(exposures, *arguments):
+        fitted.append(exposures.shape)
+        return weighted_fit(exposures, *arguments)
+
+    monkeypatch.setattr(experiment_run, "weighted_fit", fit)
+    found["part"] = experiment.run(tolerance=1e-4).metadata
+    monkeypatch.setattr(experiment_run, "region_of_spots", lambda *_: None)
+    found["whole"] = experiment.run(tolerance=1e-4).metadata
+    part, whole = fitted
+    assert part < whole == truth.shape
+    for metadata in found.values():
+        error = np.array(metadata["measured_shifts"]) - virtual.truth.shifts
+        std = np.array(metadata["measured_shift_std"])
+        assert np.abs(error[1:] / std[1:]).max() < 4  # of eight numbers: one in 2000
+    shifts, std = (
+        [np.array(each[key]) for each in found.values()]
+        for key in ("measured_shifts", "measured_shift_std")
+    )
+    # The images are the same: what differs is the error of M, in either.
+    assert (np.abs(shifts[0] - shifts[1]) < std[0].max() / 2).all()
+
+
 def test_the_second_measurement_of_shifts_gains(tmp_path, monkeypatch):
     """Six sensors in a narrow beam; calibrated with the shifts as measured once, and twice."""
-    measured = experiment_run.measured_shifts
+    measured = experiment_run.measured_moves
 
     def once(path, manifest, *_, hot):
         return measured(path, manifest, hot=hot)
@@ -136,7 +166,7 @@ def test_the_second_measurement_of_shifts_gains(tmp_path, monkeypatch):
         for k in (0, 1):
             with monkeypatch.context() as patch:
                 if k == 0:
-                    patch.setattr(experiment_run, "measured_shifts", once)
+                    patch.setattr(experiment_run, "measured_moves", once)
                 found = experiment.run(tolerance=1e-4)
             error = np.array(found.metadata["measured_shifts"]) - virtual.truth.shifts
             errors_of[k].append(error[1:])

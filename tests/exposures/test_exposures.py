@@ -76,6 +76,30 @@ def test_a_window_of_exposures_has_the_sensitivity_of_its_part():
     np.testing.assert_allclose(fit.sensitivity, part / part.mean(), rtol=1e-7)
 
 
+def test_a_part_of_exposures_keeps_what_is_known_of_its_pixels():
+    rng = np.random.default_rng(5)
+    shape, shifts, region = (48, 56), equipix.cross_pattern(5, 7), (slice(6, 44), slice(10, 52))
+    truth = simulate.paper_sensitivity(shape, rng=rng)
+    colours = np.where(np.indices(shape).sum(axis=0) % 2, 1.2, 0.8)
+    frames = simulate.exposures(truth * colours, simulate.wavy_beam(shape, rng=3), shifts)
+    marked = rng.random((5, *shape)) < 0.01
+    exposures = exposures_of(
+        frames, shifts, mask=marked, variance=rng.uniform(1, 2, frames.shape), cfa="RGGR"
+    )
+    exposures = exposures.marked(hot=marked[0])
+    part = exposures.part(region)
+    np.testing.assert_array_equal(part.response, exposures.response[region])
+    for name in ("values", "variance", "mask"):
+        np.testing.assert_array_equal(getattr(part, name), getattr(exposures, name)[:, *region])
+    np.testing.assert_array_equal(part.bad_pixels.hot, marked[0][region])
+    # The beam of a part is found without the rest of the sensor; there is no noise.
+    fit, own = part.fit(FitOptions(tolerance=1e-8)), (truth * colours)[region] / part.response
+    found = np.isfinite(fit.sensitivity)
+    np.testing.assert_allclose(fit.sensitivity[found], (own / own[found].mean())[found], rtol=1e-7)
+    with pytest.raises(ValueError, match="within a period"):
+        exposures.part((slice(5, 44), slice(10, 52)))
+
+
 def test_reversed_exposures_differ_in_the_sign_of_shifts_alone():
     exposures = exposures_of(np.ones((3, 8, 9)), [(0, 0), (1, 0), (0, 2.5)])
     back = Orientation(rows=True, cols=True)

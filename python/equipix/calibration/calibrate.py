@@ -6,7 +6,6 @@ from typing import Any, Literal
 from numpy.typing import ArrayLike
 
 from equipix._check import LOG, FluxModel, Method, Progress, naming_memory
-from equipix._native import Fit
 from equipix.calibration.result import Calibration
 from equipix.diagnosis.evidence import Evidence
 from equipix.diagnosis.inputs import BEFORE
@@ -237,18 +236,16 @@ def calibrated(
     exposures: Exposures,
     options: Options,
     *,
-    start: Fit | None = None,
     said: tuple[Finding, ...] = (),
     provenance: dict[str, Any] | None = None,
 ) -> Calibration:
     """Calibrate from exposures: weights, fit, orientation, flags, error bars, findings.
 
-    The fit starts from `start`; `said` are findings before, and `provenance` is added to the
-    metadata.
+    `said` are findings before, and `provenance` is added to the metadata.
     """
     started = now()
     said += say(*ask(BEFORE, exposures))
-    weighted = steadied(weighted_fit(exposures, options, start), exposures, options)
+    weighted = steadied(weighted_fit(exposures, options), exposures, options)
     # Until weights and priors are final.
     for step in (without_false_pixels, without_faint_pixels, widened, with_dark_misfit):
         weighted = step(weighted, options)

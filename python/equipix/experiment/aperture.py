@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -41,13 +41,25 @@ class Equalisation:
         n/(n − 2) since a pixel's n measurements determine the beam too; with two, which determine
         no noise, times 2. NaN where unknown.
     darks : sequence of ndarray
-        The dark of each exposure, where they are known.
+        The dark of each exposure on the whole sensor, where they are known.
+    corner : tuple of int
+        The pixel (row, col) of the sensor that the maps begin at.
     """
 
     gain: Array
     dark: Array
     variance: Array
     darks: Sequence[Array] = ()
+    corner: tuple[int, int] = (0, 0)
+
+    @property
+    def region(self) -> tuple[slice, slice]:
+        """The rows and columns of the sensor that the maps are of."""
+        rows, cols = (
+            slice(first, first + size)
+            for first, size in zip(self.corner, self.gain.shape, strict=True)
+        )
+        return rows, cols
 
     @classmethod
     def of(
@@ -56,8 +68,12 @@ class Equalisation:
         flags: Array,
         workers: int | None = None,
         darks: Sequence[Array] = (),
+        corner: tuple[int, int] = (0, 0),
     ) -> Self:
-        """Take it from the fit of exposures whose dark is known, or their darks are given."""
+        """Take it from the fit of exposures whose dark is known, or their darks are given.
+
+        The exposures may be those of a part of the sensor that begins at `corner`.
+        """
         exposures, fit = weighted.exposures, weighted.fit
         dark = next(iter(darks), None) if exposures.dark is None else exposures.dark
         if dark is None:
@@ -71,7 +87,7 @@ class Equalisation:
             variance = weighted.noise_variance * count / max(count - 2, 1) / known
         gain = np.where(good, fit.sensitivity, 1) * exposures.response
         gain = gain.astype(exposures.values.dtype)
-        return cls(gain, dark, np.where(good, variance, np.nan), darks)
+        return cls(gain, dark, np.where(good, variance, np.nan), darks, corner)
 
     @classmethod
     def of_colours(cls, filters: Filters | None, darks: Sequence[Array]) -> Self | None:
@@ -85,20 +101,26 @@ class Equalisation:
         """Return it for images with the dark of an exposure."""
         if not self.darks:
             return self
-        return replace(self, dark=self.darks[exposure].astype(self.gain.dtype))
+        return replace(self, dark=self.darks[exposure][self.region].astype(self.gain.dtype))
 
     def apply(self, frames: Array) -> Array:
-        """Images of the aperture as equal pixels would have given them."""
-        if frames.shape[-2:] != self.gain.shape:
+        """Images of the aperture as equal pixels would have given them, where the maps are."""
+        shape = self.darks[0].shape if self.darks else self.gain.shape
+        if frames.shape[-2:] != shape:
             raise InputError(
-                f"'calibration' is of a sensor of {self.gain.shape}, the images of the aperture "
+                f"'calibration' is of a sensor of {shape}, the images of the aperture "
                 f"have {frames.shape[-2:]} pixels"
             )
-        return np.asarray((frames - self.dark) / self.gain)
+        return np.asarray((frames[..., *self.region] - self.dark) / self.gain)
+
+    def equal(self, raw: Array, level: float | None, hot: Bools | None) -> Array:
+        """Images of equal pixels, whose hot ones are mended."""
+        known = None if hot is None else hot[self.region]
+        return mended(self.apply(raw), hot_places(raw[..., *self.region], level, known))
 
     def unequal_pixels(self, spot: Spot) -> float:
         """Variance of a centroid by the pixels that are left unequal: s²/4π."""
-        row, col = np.rint(spot.position).astype(int)
+        row, col = np.rint(spot.position - self.corner).astype(int)
         around = self.variance[
             max(row - _AROUND, 0) : row + _AROUND, max(col - _AROUND, 0) : col + _AROUND
         ]
@@ -108,24 +130,34 @@ class Equalisation:
         return float(min(np.median(known) / (4 * np.pi), _UNEQUAL_PIXELS**2))
 
 
-def measured_shifts(
+class Moves(NamedTuple):
+    """Measured moves: shifts of the exposures, their standard errors (n, 2), spots (m, 2)."""
+
+    shifts: Floats
+    std: Floats
+    spots: Floats
+
+
+def measured_moves(
     path: Path,
     manifest: Manifest,
     equalisation: Equalisation | None = None,
     *,
     hot: Bools | None = None,
-) -> tuple[Floats, Floats]:
+) -> Moves:
     """Shift of each exposure and its standard error; see `Experiment.measure_shifts`.
 
     `hot` are the pixels that the dark frames show to be hot.
     """
     first, *others = manifest.exposure
     shifts, variances = ([each] for each in _given(first))
+    places: list[Array] = []
     for number, (old, new) in enumerate(zip(manifest.exposure, others, strict=False), start=1):
         shift, variance = _given(new)
         if new.shift is None:
             equal = None if equalisation is None else equalisation.at(number)
             spots, shape = _spots(path, manifest, new, equal, hot)
+            places += (spots.before.position, spots.after.position)
             ends = ((spots.before, old.rotation), (spots.after, new.rotation))
             before, after = (in_beam(spot.position, turn, shape) for spot, turn in ends)
             shift = shifts[-1] + before - after
@@ -137,7 +169,34 @@ def measured_shifts(
             variance = variances[-1] + noise + unequal
         shifts.append(shift)
         variances.append(variance)
-    return np.array(shifts), np.sqrt(variances)
+    return Moves(np.array(shifts), np.sqrt(variances), np.reshape(places, (-1, 2)))
+
+
+_MARGIN, _SHARE, _REACH = 128, 1 / 16, 2.0
+"""Pixels beyond the outermost spots that are equalised too: the background of a spot is a surface
+fitted far around it. At least so many, this share of the sensor's side, and this many times the
+largest move, which the fit of the part must tell apart."""
+
+_MOST = 0.5
+"""Share of the sensor up to which a part of it stands for the pixels under the spots."""
+
+
+def region_of_spots(
+    moves: Moves, shape: tuple[int, int], period: tuple[int, int]
+) -> tuple[slice, slice] | None:
+    """Return the rows and columns around the spots; None if they are most of the sensor.
+
+    They begin at a multiple of the `period` of colour filters.
+    """
+    reach = _REACH * np.ptp(moves.shifts, axis=0).max()
+    region = []
+    for places, size, step in zip(moves.spots.T, shape, period, strict=True):
+        margin = max(_MARGIN, _SHARE * size, reach)
+        first = max(int(places.min() - margin), 0) // step * step
+        region.append(slice(first, min(int(places.max() + margin) + 1, size)))
+    rows, cols = region
+    pixels = (rows.stop - rows.start) * (cols.stop - cols.start)
+    return (rows, cols) if pixels <= _MOST * shape[0] * shape[1] else None
 
 
 def _given(exposure: Exposure) -> tuple[Floats, Floats]:
@@ -158,15 +217,20 @@ def _spots(
         for entry in (exposure.aperture_before, exposure.aperture_after)
         if entry is not None
     )
+    shape = before.shape[-2:]
+    level = manifest.sensor.saturation_level
     try:
-        level = manifest.sensor.saturation_level
-        if equalisation is not None:
-            before, after = (
-                mended(equalisation.apply(raw), hot_places(raw, saturation_level(raw, level), hot))
-                for raw in (before, after)
-            )
-            # In other units; the first measurement has checked that nothing saturates.
-            level, hot = None, None
-        return measure_shift(before, after, saturation=level, hot=hot), before.shape[-2:]
+        if equalisation is None:
+            return measure_shift(before, after, saturation=level, hot=hot), shape
+        before, after = (
+            equalisation.equal(raw, saturation_level(raw, level), hot) for raw in (before, after)
+        )
+        # In other units; the first measurement has checked that nothing saturates.
+        found = measure_shift(before, after)
+        first, second = (
+            replace(spot, position=spot.position + equalisation.corner)
+            for spot in (found.before, found.after)
+        )
+        return replace(found, before=first, after=second), shape
     except InputError as error:
         raise type(error)(f"{path}: move to exposure '{exposure.name}': {error}") from error

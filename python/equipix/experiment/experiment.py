@@ -1,14 +1,21 @@
 """A calibration experiment on disk, as experiment.toml describes it, and its evaluation."""
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from equipix._check import Array, ArrayLike, FluxModel, Method, Progress, naming_memory
+from equipix._check import Array, ArrayLike, Floats, FluxModel, Method, Progress, naming_memory
 from equipix.calibration.calibrate import calibrated
 from equipix.calibration.result import Calibration
 from equipix.errors import InputError
-from equipix.experiment.aperture import Equalisation, measured_shifts
+from equipix.experiment.aperture import (
+    Equalisation,
+    Moves,
+    measured_moves,
+    region_of_spots,
+)
+from equipix.experiment.darks import Darks
 from equipix.experiment.described import Described
 from equipix.experiment.manifest import Manifest
 from equipix.exposures.exposures import Exposures, FitOptions
@@ -89,7 +96,7 @@ class Experiment(Described[Manifest]):
                 "give the result of Experiment.run"
             )
         if not self._is_moved():
-            return measured_shifts(self.path, self.manifest)
+            return measured_moves(self.path, self.manifest)[:2]
         darks, equalisation = self._darks(), None
         if calibration is not None and calibration.weighted is not None:
             equalisation = Equalisation.of(
@@ -97,7 +104,7 @@ class Experiment(Described[Manifest]):
             )
         elif self.manifest.sensor.cfa is not None:
             equalisation = Equalisation.of_colours(self._average(darks).filters, darks.means)
-        return measured_shifts(self.path, self.manifest, equalisation, hot=darks.hot)
+        return measured_moves(self.path, self.manifest, equalisation, hot=darks.hot)[:2]
 
     def _is_moved(self) -> bool:
         """Whether a move is measured from images of the aperture."""
@@ -166,7 +173,7 @@ class Experiment(Described[Manifest]):
         -----
         Shifts with a standard error are refined, with it as their prior: see `calibrate`. Those
         measured from images of an aperture are measured twice, the second time on images corrected
-        by a first calibration.
+        by a first calibration of the part of the sensor around the spots.
         """
         fit_options = FitOptions.of(method, tolerance, max_sweeps, workers, progress)
         options = Options(fit_options, robust=robust, uncertainty=uncertainty)
@@ -182,7 +189,8 @@ class Experiment(Described[Manifest]):
         hot = darks.hot
         averaged = self._average(darks, workers, progress)
         colours = Equalisation.of_colours(averaged.filters, darks.means)
-        shifts, std = measured_shifts(self.path, self.manifest, colours, hot=hot)
+        moves = measured_moves(self.path, self.manifest, colours, hot=hot)
+        shifts, std = moves.shifts, moves.std
         whole = fit_options.whole_shifts
         with naming_memory("calibrating"):
             measured = measured_of(averaged)
@@ -199,17 +207,11 @@ class Experiment(Described[Manifest]):
                 len(measured),
             )
             exposures = Exposures.of(measured, positions, fluxes, mask=excluded)
-        start = None
         if whole:
             exposures = exposures.at(positions.whole(std))
         elif self._is_moved():
-            rough = replace(fit_options, tolerance=max(tolerance, _ROUGH))
-            first = weighted_fit(exposures, replace(options, fit=rough))
-            flags = pixel_flags(first, rough)
-            equalisation = Equalisation.of(first, flags, workers, darks=darks.means)
-            shifts, std = measured_shifts(self.path, self.manifest, equalisation, hot=hot)
+            shifts, std = self._measured_again(exposures, moves, darks, options)
             exposures = exposures.at(Positions.of(shifts, rotation=positions.rotation, std=std))
-            start = first.fit
         origin = self._provenance(
             hashes,
             averaged,
@@ -218,7 +220,29 @@ class Experiment(Described[Manifest]):
             measured_shifts=shifts.tolist(),
             measured_shift_std=std.tolist(),
         )
-        return calibrated(exposures, options, start=start, said=said, provenance=origin)
+        return calibrated(exposures, options, said=said, provenance=origin)
+
+    def _measured_again(
+        self, exposures: Exposures, moves: Moves, darks: Darks, options: Options
+    ) -> tuple[Floats, Floats]:
+        """Shifts and standard errors by images that a first calibration has corrected.
+
+        It is one of the part of the sensor around the spots.
+        """
+        fit = replace(options.fit, tolerance=max(options.fit.tolerance, _ROUGH))
+
+        def by(part: Exposures, corner: tuple[int, int]) -> tuple[Floats, Floats]:
+            first = weighted_fit(part, replace(options, fit=fit))
+            flags = pixel_flags(first, fit)
+            equal = Equalisation.of(first, flags, fit.workers, darks.means, corner)
+            return measured_moves(self.path, self.manifest, equal, hot=darks.hot)[:2]
+
+        period = (1, 1) if exposures.filters is None else exposures.filters.colours.period
+        if (region := region_of_spots(moves, exposures.shape, period)) is not None:
+            rows, cols = region
+            with suppress(InputError):  # a spot that reaches beyond, or exposures without light
+                return by(exposures.part(region), (rows.start, cols.start))
+        return by(exposures, (0, 0))
 
     def _unused(self, flux: FluxModel | None) -> list[Finding]:
         """Findings on values in the file that the fluxes to find leave without use."""

@@ -218,26 +218,37 @@ class Exposures(Measured):
         rows, cols = (slice(a, a + size) for a, size in zip(first, sizes, strict=True))
         return rows, cols
 
-    def window(self, side: int) -> Self:
-        """Return the central part of the sensor, at most `side` pixels along each axis."""
-        middle = self.middle(side)
-        first = np.array([each.start for each in middle])
-        sizes = np.array([each.stop for each in middle]) - first
-        part = (..., *middle)
-        variance, mask, dark = self.variance, self.mask, self.dark_variance
+    def part(self, region: tuple[slice, slice]) -> Self:
+        """Return the exposures of a part of the sensor, whole periods of filters from its corner.
+
+        Views of the arrays, but for the values and what the solver needs in one piece.
+        """
+        first = np.array([each.start for each in region])
+        sizes = np.array([each.stop for each in region]) - first
+        if self.filters is not None and np.any(first % self.filters.colours.period):
+            raise ValueError(f"{region} begins within a period of the colour filters")
+        part = (..., *region)
+
+        def of(array: Array | None) -> Array | None:
+            is_map = array is not None and array.ndim > 1
+            return np.ascontiguousarray(array[part]) if is_map and array is not None else array
+
+        found = {name: of(pixels) for name, pixels in vars(self.bad_pixels).items()}
         return dataclasses.replace(
             self,
             values=np.ascontiguousarray(self.values[part]),
             positions=self.positions.of_window(first, sizes, self.shape),
-            variance=variance[part].copy()
-            if variance is not None and variance.ndim == 3
-            else variance,
-            mask=None if mask is None else np.ascontiguousarray(mask[part]),
-            bad_pixels=BadPixels(),
+            variance=of(self.variance),
+            mask=of(self.mask),
+            bad_pixels=BadPixels(**found),
             dark=None if self.dark is None else self.dark[part],
-            dark_variance=None if dark is None else np.ascontiguousarray(dark[part]),
-            filters=None,
+            dark_variance=of(self.dark_variance),
         )
+
+    def window(self, side: int) -> Self:
+        """Return the central part of the sensor, at most `side` pixels along each axis."""
+        plain = dataclasses.replace(self, bad_pixels=BadPixels(), filters=None)
+        return plain.part(self.middle(side))
 
     def fit(self, options: FitOptions, start: Fit | None = None) -> Fit:
         """Fit sensitivity, beam and the other unknowns, from `start` if it is given.
