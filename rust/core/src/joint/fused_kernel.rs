@@ -59,6 +59,14 @@ pub(super) struct Pixels<'s> {
     pub(super) change: &'s [f32],
 }
 
+/// The values of a row from one place on. A closure would stay a call within the dispatched code.
+#[inline(always)]
+fn lanes(row: &[f32], start: usize) -> [f32; LANES] {
+    let mut values = [0.0; LANES];
+    values.copy_from_slice(&row[start..start + LANES]);
+    values
+}
+
 /// What pixels see, v, and what they pull back once M has followed: with unit vectors ê along √w e over the
 /// exposures of a pixel, v → M² (v − ê Σ ê v). Returns the largest size of the change of M less a share of
 /// the change before.
@@ -87,18 +95,18 @@ impl pulp::NullaryFnOnce for Eliminate<'_> {
         let mut largest = [0.0_f64; LANES];
         for (chunk, last) in last.chunks_mut(LANES).enumerate() {
             let start = chunk * LANES;
-            let of = |row: &[f32]| -> [f32; LANES] {
-                std::array::from_fn(|i| row[start..start + LANES][i])
-            };
             let mut along = [0.0; LANES];
             for (k, (value, &[s, t, u, v])) in values.iter_mut().zip(taps).enumerate() {
-                let [a, b, c, d] = [0, 1, 2, 3].map(|i| of(seen.row(k, index + i)));
-                let unit = of(&pixels.units[k * width..][..width]);
+                let a = lanes(seen.row(k, index), start);
+                let b = lanes(seen.row(k, index + 1), start);
+                let c = lanes(seen.row(k, index + 2), start);
+                let d = lanes(seen.row(k, index + 3), start);
+                let unit = lanes(pixels.units, k * width + start);
                 for i in 0..LANES {
                     value[i] = s * a[i] + t * b[i] + u * c[i] + v * d[i];
                 }
                 if let Some(gains) = pixels.gains {
-                    let gain = of(&gains[k * width..][..width]);
+                    let gain = lanes(gains, k * width + start);
                     for i in 0..LANES {
                         value[i] *= gain[i];
                     }
@@ -107,22 +115,22 @@ impl pulp::NullaryFnOnce for Eliminate<'_> {
                     along[i] += unit[i] * value[i];
                 }
             }
-            let square = of(pixels.square);
+            let square = lanes(pixels.square, start);
             for (k, value) in values.iter().enumerate() {
-                let unit = of(&pixels.units[k * width..][..width]);
+                let unit = lanes(pixels.units, k * width + start);
                 let mut pull = [0.0; LANES];
                 for i in 0..LANES {
                     pull[i] = square[i] * (value[i] - unit[i] * along[i]);
                 }
                 if let Some(gains) = pixels.gains {
-                    let gain = of(&gains[k * width..][..width]);
+                    let gain = lanes(gains, k * width + start);
                     for i in 0..LANES {
                         pull[i] *= gain[i];
                     }
                 }
                 pulls.row_mut(k, index)[AROUND + start..][..LANES].copy_from_slice(&pull);
             }
-            let factor = of(pixels.change);
+            let factor = lanes(pixels.change, start);
             for (i, (last, largest)) in last.iter_mut().zip(&mut largest).enumerate() {
                 let change = f64::from(factor[i] * along[i]);
                 // A maximum would lose what is no number, a minimum does not.
