@@ -152,9 +152,10 @@ def _on_convergence(e: Evidence) -> str | None:
         )
     sweeps, error = int(fit.sweeps[-1]), float(fit.error_estimate[-1])
     if error <= tolerance:
+        few = fit.ended == "sweeps used"
+        cause = "allow more" if few else "probably most pixels saturate or have no light"
         return (
-            f"not converged after {sweeps} sweeps, which are too few to estimate the error: "
-            "probably most pixels saturate or have no light"
+            f"not converged after {sweeps} sweeps, which are too few to estimate the error: {cause}"
         )
     return (
         f"not converged after {sweeps} sweeps: the estimated error is {error:.1e}, above the "
