@@ -55,15 +55,7 @@ def plan(
     **causes: Any,
 ) -> None:
     """Predict the errors of a pattern of shifts, or find better patterns."""
-    if (shifts is None) == (max_shift is None):
-        raise InputError(
-            "give either '--shifts', to evaluate a pattern, or '--max-shift', to find patterns"
-        )
-    if shifts is not None and exposures is not None:
-        raise InputError(
-            f"'--exposures' is {exposures}, but a pattern given by '--shifts' has its own: leave "
-            "one out"
-        )
+    _refuse_both(shifts, max_shift, exposures)
     said: Findings = ()
     more: list[ErrorBudget] = []
     if causes["shift_error"] and causes["beam_width"] is None:
@@ -98,6 +90,21 @@ def plan(
                 "with {exposures} positions: {rms:.2e} of all causes, {expected_passes:.0f} passes"
             )
             print(words.format(**gain))  # noqa: T201
+
+
+def _refuse_both(
+    shifts: str | None, max_shift: tuple[int, int] | None, exposures: int | None
+) -> None:
+    """Refuse options that ask for an evaluation and for a search, or for neither."""
+    if (shifts is None) == (max_shift is None):
+        raise InputError(
+            "give either '--shifts', to evaluate a pattern, or '--max-shift', to find patterns"
+        )
+    if shifts is not None and exposures is not None:
+        raise InputError(
+            f"'--exposures' is {exposures}, but a pattern given by '--shifts' has its own: leave "
+            "one out"
+        )
 
 
 def _with_more(
