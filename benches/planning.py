@@ -19,8 +19,8 @@ def rows(shape: tuple[int, int] = SHAPE, travel: int = 200) -> list[Row]:
     found = f"plan --max-shift {travel} {travel}, {shape[1]}×{shape[0]}"
     given = f"plan of cross (11, 19), {shape[1]}×{shape[0]}"
     return [
-        (f"{work}: {name}", f"<= {limit} {unit}", f"{got:.{places}f} {unit}", how)
-        for work, limit, figures in ((found, 15, searched), (given, 2, judged))
+        (f"{work}: {name}", f"<= {limit:g} {unit}", f"{got:.{places}f} {unit}", how)
+        for work, limit, figures in ((found, 15.0, searched), (given, 2.0, judged))
         for name, limit, unit, got, places, how in (
             ("time of the processor", limit, "s", figures[0], 1, "user and system, with imports"),
             ("peak memory", 0.3, "GB", figures[1], 2, "of the process"),

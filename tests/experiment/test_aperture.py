@@ -10,7 +10,7 @@ import pytest
 import equipix
 from equipix import simulate
 from equipix.errors import InputError
-from equipix.experiment.aperture import Equalisation, Moves, region_of_spots
+from equipix.experiment.aperture import Equalisation, Moves, _radius, region_of_spots
 from equipix.exposures.exposures import FitOptions
 from equipix.exposures.spots import Spot
 from equipix.findings import Flag
@@ -127,20 +127,37 @@ def test_pixels_are_not_taken_for_worse_than_before_a_calibration():
     assert below == pytest.approx(0.99 * LARGEST)
 
 
-def moves_of(spots, shifts=CROSS):
+def moves_of(spots, shifts=CROSS, radius=5.0):
     """Moves with spots at these places."""
-    return Moves(np.array(shifts, float), np.zeros((len(shifts), 2)), np.array(spots, float))
+    none = np.zeros((len(shifts), 2))
+    return Moves(np.array(shifts, float), none, np.array(spots, float), radius)
 
 
 def test_a_region_holds_all_spots_far_from_its_edges_unless_the_sensor_ends():
     spots = [(700.2, 900.8), (711.9, 881.1)]
     rows, cols = region_of_spots(moves_of(spots), (1600, 2400), (2, 3))
-    # A sixteenth of the side, of the columns more than 128; whole periods from the corner on.
+    # 128 pixels on every side; whole periods from the corner on.
     assert (rows.start, rows.stop) == (572, 840)
-    assert (cols.start, cols.stop) == (729, 1051)
+    assert (cols.start, cols.stop) == (753, 1029)
     assert rows.start % 2 == cols.start % 3 == 0
     near = region_of_spots(moves_of([(20, 30), (2390, 40)]), (2400, 2400), (1, 1))
     assert (near[0].start, near[0].stop, near[1].start) == (0, 2400, 0)
+
+
+def test_a_large_spot_takes_a_larger_region():
+    rows, cols = region_of_spots(moves_of([(700, 900)], radius=90.0), (1600, 2400), (1, 1))
+    # Two and a half times its radius on every side.
+    assert (rows.start, rows.stop, cols.start, cols.stop) == (475, 926, 675, 1126)
+
+
+@pytest.mark.parametrize(("shape", "radius"), [((120, 160), 6), ((1100, 1300), 80)])
+def test_the_radius_of_a_disc_is_found_to_a_twentieth(shape, radius):
+    place = np.array([shape[0] * 0.4, shape[1] * 0.6])
+    away = np.indices(shape) - place[:, None, None]
+    image = np.where(np.hypot(*away) < radius, 3000.0, 60.0)
+    found = _radius(image, Spot(place, np.zeros(2)))
+    # By the pixels along its outline, 2πr of πr², each in or out by chance.
+    assert abs(found / radius - 1) < 0.05
 
 
 def test_far_moves_take_a_larger_region_and_most_of_a_sensor_is_all_of_it():

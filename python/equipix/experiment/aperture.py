@@ -131,11 +131,15 @@ class Equalisation:
 
 
 class Moves(NamedTuple):
-    """Measured moves: shifts of the exposures, their standard errors (n, 2), spots (m, 2)."""
+    """Measured moves: shifts of the exposures and their standard errors (n, 2), the spots (m, 2).
+
+    `radius` is that of the largest spot, in pixels.
+    """
 
     shifts: Floats
     std: Floats
     spots: Floats
+    radius: float = 0.0
 
 
 def measured_moves(
@@ -152,11 +156,13 @@ def measured_moves(
     first, *others = manifest.exposure
     shifts, variances = ([each] for each in _given(first))
     places: list[Array] = []
+    radius = 0.0
     for number, (old, new) in enumerate(zip(manifest.exposure, others, strict=False), start=1):
         shift, variance = _given(new)
         if new.shift is None:
             equal = None if equalisation is None else equalisation.at(number)
-            spots, shape = _spots(path, manifest, new, equal, hot)
+            spots, shape, size = _spots(path, manifest, new, equal, hot)
+            radius = max(radius, size)
             places += (spots.before.position, spots.after.position)
             ends = ((spots.before, old.rotation), (spots.after, new.rotation))
             before, after = (in_beam(spot.position, turn, shape) for spot, turn in ends)
@@ -169,13 +175,13 @@ def measured_moves(
             variance = variances[-1] + noise + unequal
         shifts.append(shift)
         variances.append(variance)
-    return Moves(np.array(shifts), np.sqrt(variances), np.reshape(places, (-1, 2)))
+    return Moves(np.array(shifts), np.sqrt(variances), np.reshape(places, (-1, 2)), radius)
 
 
-_MARGIN, _SHARE, _REACH = 128, 1 / 16, 2.0
-"""Pixels beyond the outermost spots that are equalised too: the background of a spot is a surface
-fitted far around it. At least so many, this share of the sensor's side, and this many times the
-largest move, which the fit of the part must tell apart."""
+_MARGIN, _RADII, _REACH = 128, 2.5, 2.0
+"""Pixels beyond the outermost spots that are equalised too. At least so many; this many times the
+radius of a spot, which then is an eighth of the part, so that its background shows; and this many
+times the largest move, which the fit of the part must tell apart."""
 
 _MOST = 0.5
 """Share of the sensor up to which a part of it stands for the pixels under the spots."""
@@ -189,9 +195,9 @@ def region_of_spots(
     They begin at a multiple of the `period` of colour filters.
     """
     reach = _REACH * np.ptp(moves.shifts, axis=0).max()
+    margin = max(_MARGIN, _RADII * moves.radius, reach)
     region = []
     for places, size, step in zip(moves.spots.T, shape, period, strict=True):
-        margin = max(_MARGIN, _SHARE * size, reach)
         first = max(int(places.min() - margin), 0) // step * step
         region.append(slice(first, min(int(places.max() + margin) + 1, size)))
     rows, cols = region
@@ -210,8 +216,8 @@ def _spots(
     exposure: Exposure,
     equalisation: Equalisation | None,
     hot: Bools | None,
-) -> tuple[ShiftMeasurement, tuple[int, int]]:
-    """Find the spots of the move to `exposure`, and the shape of the sensor."""
+) -> tuple[ShiftMeasurement, tuple[int, int], float]:
+    """Find the spots of the move to `exposure`, the shape of the sensor, and a spot's radius."""
     before, after = (
         raw_frames(entry_files(path, entry, manifest.layout))
         for entry in (exposure.aperture_before, exposure.aperture_after)
@@ -221,7 +227,8 @@ def _spots(
     level = manifest.sensor.saturation_level
     try:
         if equalisation is None:
-            return measure_shift(before, after, saturation=level, hot=hot), shape
+            found = measure_shift(before, after, saturation=level, hot=hot)
+            return found, shape, _radius(before[0], found.before)
         before, after = (
             equalisation.equal(raw, saturation_level(raw, level), hot) for raw in (before, after)
         )
@@ -231,6 +238,21 @@ def _spots(
             replace(spot, position=spot.position + equalisation.corner)
             for spot in (found.before, found.after)
         )
-        return replace(found, before=first, after=second), shape
+        return replace(found, before=first, after=second), shape, 0.0
     except InputError as error:
         raise type(error)(f"{path}: move to exposure '{exposure.name}': {error}") from error
+
+
+_COARSE = 512
+"""Rows and columns that show how large a spot is."""
+
+
+def _radius(image: Array, spot: Spot) -> float:
+    """Radius of a disc of as many pixels as are above half of the spot's level, roughly."""
+    step = max(1, min(image.shape) // _COARSE)
+    coarse = image[::step, ::step].astype(np.float64)
+    row, col = (spot.position / step).astype(int)
+    base = np.median(coarse)
+    top = np.median(coarse[max(row - 1, 0) : row + 2, max(col - 1, 0) : col + 2])
+    area = np.count_nonzero(coarse > (base + top) / 2) * step**2
+    return float(np.sqrt(area / np.pi))
