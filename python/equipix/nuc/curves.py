@@ -5,6 +5,7 @@ from math import comb
 import numpy as np
 
 from equipix._check import Array, Floats
+from equipix.measured.part import blocks
 
 
 def response_at(deviation: Array, mean: Array | float) -> Floats:
@@ -71,9 +72,11 @@ def polynomial(coefficients: Array, x: Array | float) -> Floats:
 def counted_from(coefficients: Array, dark: Array) -> Floats:
     """Coefficients d of Σ d_j y^j = Σ c_j (y − dark)^j."""
     moved: Floats = np.zeros(coefficients.shape)
-    for power, coefficient in enumerate(coefficients):
-        for lower in range(power + 1):
-            moved[lower] += comb(power, lower) * coefficient * (-dark) ** (power - lower)
+    for rows in blocks(dark.shape):
+        for power, coefficient in enumerate(coefficients[:, rows]):
+            for lower in range(power + 1):
+                shift = (-dark[rows]) ** (power - lower)
+                moved[lower, rows] += comb(power, lower) * coefficient * shift
     return moved
 
 

@@ -14,6 +14,7 @@ from equipix.findings import Findings, usable
 from equipix.io.record import Counts, Doubles, Map, Record
 from equipix.measured.colour import Colours
 from equipix.measured.noise import median_of_noise
+from equipix.measured.part import blocks, chosen
 from equipix.nuc.curves import counted_from, exact_inverse, response_at, slope_at
 
 _LARGEST = int(np.iinfo(np.uint32).max)
@@ -278,10 +279,15 @@ def typical(squares: Floats, freedom: Array) -> float:
 
 
 def common_misfit(response: Response) -> float:
-    """Reduced χ² that usable pixels have in common, over that of noise alone."""
+    """Reduced χ² that usable pixels have in common, over that of noise alone.
+
+    Of more than 2¹⁹ pixels so many, evenly over the sensor, are asked: with one degree of freedom
+    it errs by 0.3 %.
+    """
     if response.metadata.get("options", {}).get("weights") != "variances":
         return float("nan")
-    judged = usable(response.flags) & (response.freedom > 0)
-    if not judged.any():
+    freedom = response.freedom
+    judged = chosen(usable(response.flags) & (freedom > 0))
+    if not judged.size:
         return float("nan")
-    return typical(response.reduced_chi2[judged], response.freedom[judged])
+    return typical(response.reduced_chi2.flat[judged], freedom.flat[judged])
