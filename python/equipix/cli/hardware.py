@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import typer
 
 from equipix._check import Array, naming_memory
@@ -170,7 +171,7 @@ def _level(pattern: str) -> tuple[Array, Findings]:
             f"{pattern}: holds one frame, expected two or more: each 'frames' names all of a "
             'level, as "level/*.tif" does'
         )
-    return raw, said
+    return np.stack([*raw]), said
 
 
 def _cost_figures(cost: Cost) -> dict[str, float]:

@@ -124,9 +124,7 @@ def dead_pixels(
 
 def _bands(medians: Array) -> Iterator[tuple[slice, Array]]:
     """Rows of each row of blocks, with the medians of these blocks."""
-    return (
-        (slice(BLOCK * k, BLOCK * (k + 1)), medians[k : k + 1]) for k in range(len(medians))
-    )
+    return ((slice(BLOCK * k, BLOCK * (k + 1)), medians[k : k + 1]) for k in range(len(medians)))
 
 
 def hot_pixels(dark: FrameStatistics, noise: NoiseModel | None) -> Array:

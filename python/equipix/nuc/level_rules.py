@@ -76,8 +76,7 @@ def _at_highest(measured: Measured) -> tuple[float, list[float]]:
         return top, [0.0] * len(tops)
     least = top * (1 - ROUNDING)
     return whole(top), [
-        _share(measured, level, least) if each >= least else 0.0
-        for level, each in enumerate(tops)
+        _share(measured, level, least) if each >= least else 0.0 for level, each in enumerate(tops)
     ]
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, DTypeLike
 
 from equipix._check import Array, Bools, Floats, as_array, naming_memory
 from equipix.correction.apply import CorrectionBase, Formula, checked_frames
@@ -14,7 +14,7 @@ from equipix.findings import Findings, usable
 from equipix.io.record import Counts, Doubles, Map, Record
 from equipix.measured.colour import Colours
 from equipix.measured.noise import median_of_noise
-from equipix.measured.part import blocks, chosen
+from equipix.measured.part import chosen
 from equipix.nuc.curves import counted_from, exact_inverse, response_at, slope_at
 
 _LARGEST = int(np.iinfo(np.uint32).max)
@@ -146,6 +146,12 @@ class Response(CorrectionBase, Record, kind="response", version=2):
         """
         return self.inverse.copy() if self.dark is None else counted_from(self.inverse, self.dark)
 
+    def _planes(self, dtype: DTypeLike) -> Array:
+        """The coefficients, rounded to a dtype block by block."""
+        if self.dark is None:
+            return np.asarray(self.inverse, dtype)
+        return counted_from(self.inverse, self.dark, dtype)
+
     @property
     def largest_inverse_error(self) -> float:
         """Largest difference of the cubic to the exact inverse over usable pixels, in DN."""
@@ -248,7 +254,8 @@ def pattern_variance(response: Response, level: float) -> float:
 
     With x the powers of V̄ it is xᵀ C x over the square of the slope. C, the covariance of the
     coefficients, is that of the weights of the levels, times what the variance of the highest
-    coefficient of a pixel says. The noise of a stored dark cancels. NaN behind colour filters,
+    coefficient of a pixel says; of more than 2¹⁹ pixels so many, evenly over the sensor, are asked.
+    The noise of a stored dark cancels. NaN behind colour filters,
     whose levels are not stored, and for one point by gain, or by offset with a dark.
     """
     noise, order = response.metadata.get("level_variances"), response.order
@@ -264,9 +271,10 @@ def pattern_variance(response: Response, level: float) -> float:
     covariance = np.linalg.inv(design.T @ (design / np.reshape(noise, (-1, 1))))
     at = (level / scale) ** np.arange(order + 1)
     share = float(at @ covariance @ at / covariance[-1, -1]) * scale ** (2 * order)
-    good = usable(response.flags) & (response.used == len(response.levels))
-    slope = np.broadcast_to(slope_at(response.deviation, level), response.shape)
-    return float(np.mean(share * response.variances[-1][good] / slope[good] ** 2))
+    good = chosen(usable(response.flags) & (response.used == len(response.levels)))
+    place = np.unravel_index(good, response.shape)
+    slope = slope_at(response.deviation[:, *place][:, None], level)
+    return float(np.mean(share * response.variances[-1][place] / slope**2))
 
 
 def typical(squares: Floats, freedom: Array) -> float:
