@@ -16,6 +16,7 @@ import applying
 import averaging
 import cargo
 import large
+import levels
 import multiscale
 import numpy as np
 import reporting
@@ -45,6 +46,7 @@ def main(*, smoke: bool) -> None:
     rows += subpixel.rows((48, 64), repetitions=1) if smoke else subpixel.rows()
     rows += experiment.rows((96, 128), frames=2, repetitions=1) if smoke else experiment.rows()
     rows += large.rows((96, 128)) if smoke else large.rows()
+    rows += levels.rows((96, 128), frames=3) if smoke else levels.rows()
     rows += reporting.rows((96, 128)) if smoke else reporting.rows()
     rows += averaging.rows(frames=3, repetitions=1) if smoke else averaging.rows()
     rows += response.rows(shape=(24, 32), repetitions=1) if smoke else response.rows()

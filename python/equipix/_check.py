@@ -30,7 +30,7 @@ Ints: TypeAlias = NDArray[np.int64]
 
 Bools: TypeAlias = NDArray[np.bool_]
 
-Pixels: TypeAlias = EllipsisType | slice | tuple[Ints, Ints]
+Pixels: TypeAlias = EllipsisType | slice | tuple[Array, ...]
 """All pixels of a map, blocks of rows, or rows and columns of some."""
 
 Progress: TypeAlias = Callable[[int, int, str], object]

@@ -187,7 +187,8 @@ def _of_good(
         bad[name].add(plane[flagged[name]][None])
 
     _each_plane(correction, raw, "keep", colours, add)
-    result, said = {}, ()
+    result: dict[str, dict[str, Any]] = {}
+    said: Findings = ()
     for name, sums in good.items():
         steady = say(*ask(STEADY, sums.steadiness))
         found = judged(sums, confidence, steady)

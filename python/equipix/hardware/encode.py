@@ -259,7 +259,7 @@ def origin(correction: Correction) -> dict[str, Any]:
     digest = hashlib.sha256()
     for array in (np.asarray(correction.coefficients, "<f8"), np.asarray(correction.flags, "<u4")):
         digest.update(f"{array.shape}".encode())
-        digest.update(np.ascontiguousarray(array))
+        digest.update(np.ascontiguousarray(array).data)
     sensor = sensor_table(correction.metadata)
     return {
         "equipix": __version__,

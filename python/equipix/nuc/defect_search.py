@@ -119,8 +119,9 @@ def of_frames(
     return found, said
 
 
-def too_few_for_flicker(count: int, limits: DefectLimits) -> dict[str, str]:
-    """Say that so many frames are too few to find flicker, if they are."""
+def too_few_for_flicker(frames: object, limits: DefectLimits) -> dict[str, str]:
+    """Say that frames are too few to find flicker, if they are."""
+    count = len(frames if isinstance(frames, FrameFiles) else np.asarray(frames))
     needed = int(np.ceil((limits.correlation / _CORRELATED) ** 2 - 2))
     return {"flickering": f"below {needed} frames"} if count < needed else {}
 
@@ -305,7 +306,7 @@ def find_defects(
     flags = response.flags.copy()
     for kind, pixels in found.items():
         set_bits(flags, kind, pixels)
-    few = too_few_for_flicker(len(frames), limits) if "flickering" in found else {}
+    few = too_few_for_flicker(frames, limits) if "flickering" in found else {}
     counts = {kind: int(np.count_nonzero(each)) for kind, each in found.items() if kind not in few}
     counts["unusable"] = int(np.count_nonzero(~usable(flags)))
     known = known_part(slope) - 1

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from equipix._check import Array, Bools, Ints
+from equipix._check import Array, Bools
 from equipix.errors import InputError
 from equipix.findings import Rule, usable
 from equipix.measured.defects import SIGMAS
@@ -122,7 +122,7 @@ _TAIL = 0.01
 """Share of the pixels beyond the ends of a level's values."""
 
 
-_Pixels = tuple[Ints, Ints]
+_Pixels = tuple[Array, ...]
 """Rows and columns of pixels."""
 
 

@@ -126,9 +126,15 @@ class Response(CorrectionBase, Record, kind="response", version=2):
     @property
     def freedom(self) -> Array:
         """Degrees of freedom of each pixel's fit: levels used less coefficients, 0 or more."""
+        freedom = self.used.astype(np.int64)
+        freedom -= self._terms
+        return np.maximum(freedom, 0, out=freedom)
+
+    @property
+    def _terms(self) -> int:
+        """Number of coefficients that were fitted to each pixel."""
         by_gain = self.metadata.get("options", {}).get("order") == 0
-        terms = 1 if by_gain else len(self.deviation)
-        return np.maximum(self.used.astype(np.int64) - terms, 0)
+        return 1 if by_gain else len(self.deviation)
 
     @property
     def valid_range(self) -> Floats:
@@ -273,7 +279,7 @@ def pattern_variance(response: Response, level: float) -> float:
     share = float(at @ covariance @ at / covariance[-1, -1]) * scale ** (2 * order)
     good = chosen(usable(response.flags) & (response.used == len(response.levels)))
     place = np.unravel_index(good, response.shape)
-    slope = slope_at(response.deviation[:, *place][:, None], level)
+    slope = slope_at(np.stack([each[place] for each in response.deviation])[:, None], level)
     return float(np.mean(share * response.variances[-1][place] / slope**2))
 
 
@@ -294,8 +300,8 @@ def common_misfit(response: Response) -> float:
     """
     if response.metadata.get("options", {}).get("weights") != "variances":
         return float("nan")
-    freedom = response.freedom
-    judged = chosen(usable(response.flags) & (freedom > 0))
+    judged = chosen(usable(response.flags) & (response.used > response._terms))
     if not judged.size:
         return float("nan")
-    return typical(response.reduced_chi2.flat[judged], freedom.flat[judged])
+    freedom = response.used.flat[judged].astype(np.int64) - response._terms
+    return typical(response.reduced_chi2.flat[judged], freedom)
