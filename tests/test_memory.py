@@ -124,7 +124,7 @@ except equipix.errors.InsufficientMemoryError as error:
 def test_response_curves_count_their_bytes():
     said = run(RESPONSE)
     assert "fitting response curves of (1500, 1500) needs" in said.stdout
-    # 44 bytes for the planes of a pixel, 80 for its polynomial in 64 rows, 64 MiB for the allocator.
+    # 44 bytes for the planes of a pixel, 80 for its polynomial in 64 rows, and the 64 MiB.
     needed = 44 * 1500**2 + 80 * 64 * 1500 + 2**26
     assert f"({needed} bytes)" in said.stdout, said.stdout + said.stderr
 
