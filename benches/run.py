@@ -16,6 +16,7 @@ import applying
 import averaging
 import cargo
 import large
+import levels
 import multiscale
 import numpy as np
 import planning
@@ -47,6 +48,7 @@ def main(*, smoke: bool) -> None:
     rows += experiment.rows((96, 128), frames=2, repetitions=1) if smoke else experiment.rows()
     rows += large.rows((96, 128)) if smoke else large.rows()
     rows += planning.rows((96, 128), travel=20) if smoke else planning.rows()
+    rows += levels.rows((96, 128), frames=3) if smoke else levels.rows()
     rows += reporting.rows((96, 128)) if smoke else reporting.rows()
     rows += averaging.rows(frames=3, repetitions=1) if smoke else averaging.rows()
     rows += response.rows(shape=(24, 32), repetitions=1) if smoke else response.rows()

@@ -113,7 +113,7 @@ import equipix
 from equipix.nuc.levels import levels_of
 levels = levels_of(np.random.default_rng(0).uniform(1, 2, (2, 1500, 1500)) * [[[1]], [[9]]])
 levels.fit(1, "offset", workers=1)
-limit(200 * 10**6)
+limit(100 * 10**6)
 try:
     levels.fit(1, "offset", workers=1)
 except equipix.errors.InsufficientMemoryError as error:
@@ -124,8 +124,9 @@ except equipix.errors.InsufficientMemoryError as error:
 def test_response_curves_count_their_bytes():
     said = run(RESPONSE)
     assert "fitting response curves of (1500, 1500) needs" in said.stdout
-    # 80 bytes for the polynomial of a pixel, 44 for its planes, and 64 MiB for the allocator.
-    assert f"({124 * 1500**2 + 2**26} bytes)" in said.stdout, said.stdout + said.stderr
+    # 44 bytes for the planes of a pixel, 80 for its polynomial in 64 rows, and the 64 MiB.
+    needed = 44 * 1500**2 + 80 * 64 * 1500 + 2**26
+    assert f"({needed} bytes)" in said.stdout, said.stdout + said.stderr
 
 
 CHILDREN = f"""
@@ -263,12 +264,13 @@ def write_files(folder, shape):
     return paths
 
 
-QUALITY = """
+NUC = """
 from equipix import cli
 from equipix.cli.app import command
 command("nuc")
-limit(190 * 10**6)
-cli.main(["nuc", *sys.argv[1:]])
+import equipix.io.record
+limit(int(sys.argv[1]) * 10**6)
+cli.main(["nuc", *sys.argv[2:]])
 """
 
 
@@ -276,32 +278,68 @@ cli.main(["nuc", *sys.argv[1:]])
     ("command", "work"), [("quality", "measuring quality"), ("defects", "finding bad pixels")]
 )
 def test_commands_on_frames_of_one_level_name_it(tmp_path, command, work):
-    shape = (250, 250)
-    response = equipix.nuc.fit(np.ones((2, *shape)) * [[[100.0]], [[200.0]]])
-    response.save(tmp_path / "response.tif")
-    # 100 MB of frames, which are held twice while they are joined.
-    said = run(QUALITY, command, tmp_path / "response.tif", *write_files(tmp_path, shape))
-    assert said.returncode == 1, said.stderr
-    assert re.fullmatch(rf"equipix: error: {work}: .*\n", said.stderr), said.stderr
-
-
-@pytest.mark.parametrize("filters", [[], ["--cfa", "RGGB"]], ids=["plain", "colours"])
-def test_quality_holds_one_stack_of_corrected_frames(tmp_path, filters):
-    """Beside the raw frames, with less than another stack for means: with all three it is 4.2."""
-    shape = (100, 120)
+    """Where reading the response, of 46 MB, leaves too little; a step in it may name itself."""
+    shape = (600, 800)
     response = equipix.nuc.fit(np.ones((2, *shape)) * [[[100.0]], [[200.0]]])
     response.save(tmp_path / "response.npz")
-    frames = np.random.default_rng(1).normal(150, 3, (400, *shape)).astype(np.float32)
+    frames = np.random.default_rng(1).integers(100, 200, (2, *shape), dtype=np.uint16)
     write_frames(tmp_path / "raw.tif", frames, nbytes=frames.nbytes)
-    arguments = ["nuc", "quality", str(tmp_path / "response.npz"), str(tmp_path / "raw.tif")]
+    arguments = command, tmp_path / "response.npz", tmp_path / "raw.tif"
+    said = [run(NUC, limit, *arguments) for limit in (80, 90, 100)]
+    refused = [each.stderr for each in said if each.returncode == 1]
+    assert len(refused) == sum(each.returncode != 0 for each in said)
+    assert all(re.fullmatch(r"equipix: error: .*\n", each) for each in refused), refused
+    assert any(each.startswith(f"equipix: error: {work}: ") for each in refused), refused
+
+
+def peak_of(arguments):
+    """Most memory that a command asks NumPy for."""
     tracemalloc.start()
     try:
         with pytest.raises(SystemExit, match="0"):
-            cli.main([*arguments, *filters])
-        peak = tracemalloc.get_traced_memory()[1]
+            cli.main([*map(str, arguments)])
+        return tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert peak < 3 * frames.nbytes
+
+
+@pytest.mark.parametrize("command", ["quality", "defects"])
+@pytest.mark.parametrize("filters", [[], ["--cfa", "RGGB"]], ids=["plain", "colours"])
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+def test_memory_does_not_grow_with_the_frames_of_a_level(tmp_path, command, filters, dtype):
+    """Eight times as many files take less than one more frame."""
+    shape = (200, 300)
+    response = equipix.nuc.fit(np.ones((2, *shape)) * [[[100.0]], [[200.0]]])
+    response.save(tmp_path / "response.npz")
+    rng = np.random.default_rng(1)
+    for number in range(32):
+        frames = np.rint(rng.normal(150, 3, (2, *shape))).astype(dtype)
+        write_frames(tmp_path / f"raw{number:02}.tif", frames, nbytes=frames.nbytes)
+    start = ["nuc", command, tmp_path / "response.npz", *filters]
+    peak_of([*start, tmp_path / "raw00.tif", tmp_path / "raw01.tif"])  # what is imported once
+    few, many = (
+        peak_of([*start, *sorted(tmp_path.glob(f"raw{each}*.tif"))]) for each in ("00", "")
+    )
+    assert many - few < frames[0].nbytes + 2**17  # and the names of the files
+
+
+def test_memory_of_levels_is_that_of_their_means(tmp_path):
+    """Each level more is a mean and a variance, of 8 and 4 bytes; nothing else grows with it."""
+    shape, peaks = (300, 400), {}
+    rng = np.random.default_rng(1)
+    for count in (2, 2, 10):
+        lines = []
+        for number in range(count):
+            frames = rng.normal(100 * (number + 1), 3, (3, *shape))
+            frames = np.rint(frames).astype(np.uint16)
+            write_frames(tmp_path / f"{number}.tif", frames, nbytes=frames.nbytes)
+            lines.append(f'[[level]]\nframes = "{number}.tif"')
+        (tmp_path / "levels.toml").write_text("\n".join(lines))
+        output = tmp_path / "response.npz"
+        peaks[count] = peak_of(["nuc", "fit", tmp_path / "levels.toml", "-o", output, "--force"])
+    pixels = shape[0] * shape[1]
+    # Raw levels are counted from the lowest, in a stack of as many more bytes.
+    assert peaks[10] - peaks[2] < 8 * (8 + 4 + 8) * pixels + 2 * pixels
 
 
 def test_the_cost_of_words_holds_one_level(tmp_path):

@@ -5,6 +5,7 @@ import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from os import PathLike
+from types import EllipsisType
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -28,6 +29,9 @@ Floats: TypeAlias = NDArray[np.float64]
 Ints: TypeAlias = NDArray[np.int64]
 
 Bools: TypeAlias = NDArray[np.bool_]
+
+Pixels: TypeAlias = EllipsisType | slice | tuple[Array, ...]
+"""All pixels of a map, blocks of rows, or rows and columns of some."""
 
 Progress: TypeAlias = Callable[[int, int, str], object]
 """Called as ``progress(done, total, stage)``; an exception in it stops the work."""

@@ -369,7 +369,9 @@ class TestDefectsAndQuality:
         replaced = response.correct(raw, flagged="replace")
         noise = metrics.three_d_noise(replaced)
         assert told["noise_variances"] == pytest.approx(vars(noise))
-        assert told["roughness"] == pytest.approx(metrics.roughness(replaced.mean(axis=0)))
+        assert told["roughness"] == pytest.approx(
+            metrics.roughness(replaced.mean(axis=0, dtype=float))
+        )
 
     def test_quality_has_a_verdict(self, run, array, saved, folder, tmp_path):
         _, path = saved

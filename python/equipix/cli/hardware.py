@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import typer
 
 from equipix._check import naming_memory
@@ -164,7 +165,7 @@ def _tried(correction: Correction, pattern: str, options: dict[str, Any]) -> tup
             f"{pattern}: holds one frame, expected two or more: each 'frames' names all of a "
             'level, as "level/*.tif" does'
         )
-    return trial(correction, raw, **options), said
+    return trial(correction, np.stack([*raw]), **options), said
 
 
 def _cost_figures(cost: Cost) -> dict[str, float]:

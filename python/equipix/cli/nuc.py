@@ -1,7 +1,8 @@
 """Commands about corrections with a uniform source: nuc fit, nuc defects, nuc quality."""
 
 import math
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,14 +15,19 @@ from equipix._check import Array, By, Flagged, Order, naming_memory
 from equipix.cli import terminal
 from equipix.correction.protocol import Correction, check_sensor, named_cfa
 from equipix.experiment.level_experiment import LevelExperiment
-from equipix.findings import Findings
+from equipix.findings import Findings, ask, say, usable
 from equipix.io.formats import SAVED, SUFFIXES
+from equipix.io.frames import FrameFiles
 from equipix.io.paths import find_files, refuse_inputs
 from equipix.io.record import read_record
 from equipix.measured.colour import Colours
 from equipix.measured.defects import SIGMAS, DefectLimits
 from equipix.measured.noise import ROBUST
-from equipix.metrics.correctability import Correctability
+from equipix.measured.part import median
+from equipix.metrics.correctability import Correctability, judged
+from equipix.metrics.frame_noise import STEADY, refuse_lost, stack_of, used_in
+from equipix.metrics.sums import Sums
+from equipix.metrics.three_d import components
 from equipix.nuc.defect_search import find_defects
 from equipix.nuc.response import Response, pattern_variance
 from equipix.report.figures import flagged as flag_counts
@@ -135,47 +141,99 @@ def quality(
 
 
 def _quality(
-    correction: Correction, raw: Array, colours: Colours | None, confidence: float
+    correction: Correction, raw: FrameFiles, colours: Colours | None, confidence: float
 ) -> tuple[dict[str, Any], Findings]:
     """Measure spatial over temporal noise of corrected frames, and its parts; of each plane."""
-
-    def planes(flagged: Flagged) -> Iterable[tuple[str, Array]]:
-        corrected = correction.correct(raw, flagged=flagged)
-        return ({"": corrected} if colours is None else metrics.planes(corrected, colours)).items()
-
-    # Of long series one stack of corrected frames at a time is held.
-    usable = {
-        name: (metrics.correctability(plane, confidence=confidence), plane.mean(axis=0))
-        for name, plane in planes("nan")
-    }
-    kept = {k: metrics.correctability(v).ratio for k, v in planes("keep")}
-    parts = {
-        k: {
-            "noise_variances": asdict(metrics.three_d_noise(v)),
-            "roughness": metrics.roughness(v.mean(axis=0)),
-        }
-        for k, v in planes("replace")
-    }
-    result = {
-        name: {
-            "frames": good.frames,
-            "pixels": good.pixels,
-            "C": good.ratio,
-            "C_from": good.low,
-            "C_to": good.high,
-            **_judged(correction, good, mean),
-            "C_with_flagged_pixels": kept[name],
-            "spatial_variance": good.spatial_variance,
-            "temporal_variance": good.temporal_variance,
-            **parts[name],
-        }
-        for name, (good, mean) in usable.items()
-    }
-    said = tuple(each for good, _ in usable.values() for each in good.findings)
+    stack_of("frames", raw)
+    # One sum of all pixels at a time, so frames are read twice.
+    found, said = _of_good(correction, raw, colours, confidence)
+    parts = _of_replaced(correction, raw, colours)
+    result = {name: {**figures, **parts[name]} for name, figures in found.items()}
     return result[""] if colours is None else result, said
 
 
-def _judged(correction: Correction, found: Correctability, mean: Array) -> dict[str, Any]:
+def _planes(frame: Array, colours: Colours | None) -> dict[str, Array]:
+    """Each plane of colour filters by its name, or all pixels under no name."""
+    return {"": frame} if colours is None else metrics.planes(frame, colours)
+
+
+def _each_plane(
+    correction: Correction,
+    raw: FrameFiles,
+    flagged: Flagged,
+    colours: Colours | None,
+    add: Callable[[str, Array], None],
+) -> None:
+    """Hand on each plane of each corrected frame by its name."""
+    for frame in raw:
+        planes = _planes(correction.correct(frame, flagged=flagged), colours)
+        for name in [*planes]:
+            add(name, planes.pop(name))  # nothing is left of it when the next frame is corrected
+
+
+def _of_good(
+    correction: Correction, raw: FrameFiles, colours: Colours | None, confidence: float
+) -> tuple[dict[str, dict[str, Any]], Findings]:
+    """C of each plane without flagged pixels and with them, and what noise predicts."""
+    flagged, finite = (_planes(each, colours) for each in (~usable(correction.flags), used_in(raw)))
+    good: dict[str, Sums] = {}
+    bad: dict[str, Sums] = {}
+
+    def add(name: str, plane: Array) -> None:
+        if name not in good:
+            known = finite[name] & np.isfinite(plane)
+            good[name] = Sums(known & ~flagged[name])
+            bad[name] = Sums(known[flagged[name]][None])
+        good[name].add(plane)
+        bad[name].add(plane[flagged[name]][None])
+
+    _each_plane(correction, raw, "keep", colours, add)
+    result: dict[str, dict[str, Any]] = {}
+    said: Findings = ()
+    for name, sums in good.items():
+        steady = say(*ask(STEADY, sums.steadiness))
+        found = judged(sums, confidence, steady)
+        said += steady
+        result[name] = {
+            "frames": found.frames,
+            "pixels": found.pixels,
+            "C": found.ratio,
+            "C_from": found.low,
+            "C_to": found.high,
+            **_judged(correction, found, sums),
+            "spatial_variance": found.spatial_variance,
+            "temporal_variance": found.temporal_variance,
+        }
+        sums.join(flagged[name], bad[name])
+        result[name]["C_with_flagged_pixels"] = judged(sums).ratio
+    return result, said
+
+
+def _of_replaced(
+    correction: Correction, raw: FrameFiles, colours: Colours | None
+) -> dict[str, dict[str, Any]]:
+    """Components of the noise, and roughness, of each plane with flagged pixels replaced."""
+    every: dict[str, Sums] = {}
+    lost = Counter[str]()
+
+    def add(name: str, plane: Array) -> None:
+        lost[name] += int(np.count_nonzero(~np.isfinite(plane)))
+        if name not in every:
+            every[name] = Sums(np.ones(plane.shape, bool))
+        every[name].add(plane)
+
+    _each_plane(correction, raw, "replace", colours, add)
+    refuse_lost("frames", lost.total())
+    return {
+        name: {
+            "noise_variances": asdict(components(sums)),
+            "roughness": metrics.roughness(sums.mean),
+        }
+        for name, sums in every.items()
+    }
+
+
+def _judged(correction: Correction, found: Correctability, sums: Sums) -> dict[str, Any]:
     """C that the noise of the response predicts, whether it lies in the interval, what to do."""
     variance = math.nan
     if isinstance(correction, Response):
@@ -185,7 +243,7 @@ def _judged(correction: Correction, found: Correctability, mean: Array) -> dict[
         words = "not judged: no noise is predicted for this correction (a response without filters)"
     elif found.low > predicted:
         limit = variance + found.temporal_variance / found.frames
-        words = "the pattern is above that of noise: " + _cause(correction, mean, limit)
+        words = "the pattern is above that of noise: " + _cause(correction, sums, limit)
     elif found.high < predicted:
         words = "the pattern is below that of noise: give frames that the fit has not used"
     else:
@@ -193,13 +251,14 @@ def _judged(correction: Correction, found: Correctability, mean: Array) -> dict[
     return {"C_predicted": predicted, "verdict": words}
 
 
-def _cause(correction: Correction, mean: Array, variance: float) -> str:
+def _cause(correction: Correction, sums: Sums, variance: float) -> str:
     """Say what makes a pattern that is above noise of this variance, and what to do."""
-    away = np.abs(mean - np.nanmedian(mean))
-    far = away > SIGMAS * ROBUST * np.nanmedian(away)
+    mean = sums.mean[sums.used]
+    away = np.abs(mean - median(mean))
+    far = away > SIGMAS * ROBUST * median(away)
     odd = int(np.count_nonzero(far))
     # Without these few pixels the rest is as noise has it.
-    if odd and np.nanvar(mean[~far]) < variance * (1 + SIGMAS * math.sqrt(2 / mean.size)):
+    if odd and np.var(mean[~far]) < variance * (1 + SIGMAS * math.sqrt(2 / sums.mean.size)):
         return f"{odd} pixels far off make it, flag them by equipix nuc defects with these frames"
     if any(each.kind == "misfit" for each in correction.findings):
         return "the curves do not follow the levels (see the findings of the response), fit again"

@@ -13,15 +13,15 @@ from typing import Annotated, Any
 import typer
 from typer.models import OptionInfo
 
-from equipix._check import Array, Bools, Progress
+from equipix._check import Bools, Progress
 from equipix.calibration.result import Calibration
-from equipix.correction.correct_files import warn_of_corrected
+from equipix.correction.correct_files import is_corrected, warn_of_corrected
 from equipix.correction.polynomial import Polynomial
 from equipix.errors import FileError, InputError
 from equipix.experiment import image_files
 from equipix.findings import Findings
 from equipix.io.formats import raw_header, read_mask
-from equipix.io.frames import read_frames
+from equipix.io.frames import FrameFiles
 from equipix.io.paths import find_files, refuse_inputs
 from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.response import Response
@@ -171,13 +171,19 @@ def check_output(
     refuse_inputs([path], list(inputs))
 
 
-def raw_frames(frames: Iterable[str], correction: Path | None = None) -> tuple[Array, Findings]:
-    """Read raw frames; refuse files that equipix has saved, and warn of those it has corrected."""
+def raw_frames(
+    frames: Iterable[str], correction: Path | None = None
+) -> tuple[FrameFiles, Findings]:
+    """Find raw frames; refuse files that equipix has saved, and warn of those it has corrected."""
     files = find_files(frames)
     headers = {file: raw_header(file) for file in files}
-    origin = "" if correction is None else image_files.origin_of(correction)
+    marked = any(is_corrected(each.description) for each in headers.values())
+    # The hash of a large correction takes seconds.
+    origin = image_files.origin_of(correction) if correction is not None and marked else ""
     said = warn_of_corrected(headers, origin)
-    return read_frames(files), said
+    first = headers[files[0]]
+    count = sum(headers[file].shape[0] for file in files)
+    return FrameFiles(tuple(files), (count, *first.shape[1:]), first.dtype), said
 
 
 def given(*paths: Path | None) -> list[Path]:

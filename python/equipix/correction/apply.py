@@ -228,6 +228,9 @@ def _prepared(correction: Any, dark: Dark, flagged: Flagged, *, double: bool) ->
     last: tuple[Any, Prepared] | None = getattr(correction, "_last", None)
     if stays and last is not None and last[0] == key:
         return last[1]
+    if stays:
+        object.__setattr__(correction, "_last", None)  # its memory, before more is taken
+        del last
     planes = with_dark(correction, dark)._planes(_DOUBLE if double else FAST[-1])
     made = Prepared(correction, planes, flagged, double=double)
     if stays:

@@ -12,6 +12,7 @@ from equipix._check import Array, Flagged, as_array, described
 from equipix.errors import InputError
 from equipix.findings import Finding
 from equipix.measured.colour import Colours
+from equipix.measured.part import median
 from equipix.measured.statistics import FrameStatistics, refuse_subtracted
 
 Dark = Literal["stored"] | FrameStatistics | ArrayLike | None
@@ -261,10 +262,9 @@ _DARK = 10.0
 
 def depth_of(correction: Correction) -> Depth:
     """Return the bits of raw values, with what shows that frames are in another unit."""
-    known = np.zeros(0)
+    dark = 0.0
     if correction.dark is not None:
-        known = correction.dark[np.isfinite(correction.dark)]
+        dark = float(np.nan_to_num(median(correction.dark)))
     elif correction.leaves_offset and correction.limits is not None:
-        known = np.fmin.reduce(correction.limits[0], axis=None, keepdims=True)
-    dark = float(np.median(known)) if known.size else 0.0
+        dark = float(np.nan_to_num(np.fmin.reduce(correction.limits[0], axis=None)))
     return Depth(correction.bits, correction.saturation is not None, dark)

@@ -108,6 +108,7 @@ class LevelExperiment(Described[LevelManifest]):
             for name, level, mean, dark in named
         ]
         origin = self._provenance(hashes, averaged, levels=written)
+        del averaged, darks  # their maps, before those of the curves are made
         return fitted(levels, order=order, by=by, workers=workers, provenance=origin)
 
     def _falling(self, levels: Levels) -> str | None:

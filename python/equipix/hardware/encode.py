@@ -14,6 +14,7 @@ from equipix.errors import InputError
 from equipix.findings import set_bits, usable
 from equipix.hardware.table_files import DTYPES, Content
 from equipix.hardware.words import Format, Words
+from equipix.measured.part import blocks, chosen, median
 
 _FINEST_GAIN = -40
 """Exponent of the finest step of a gain."""
@@ -145,7 +146,8 @@ def refuse_far_offsets(
 ) -> None:
     """Refuse few offsets far from most that make the words of all the others coarse.
 
-    The first parameter is what `encode` made of the others.
+    The first parameter is what `encode` made of the others. What is usual is asked of 2¹⁹ pixels,
+    evenly over the sensor, where there are more.
 
     Raises
     ------
@@ -153,8 +155,12 @@ def refuse_far_offsets(
         With their places, and what the largest error is without them.
     """
     used, step, error = usable(found.flags), 2.0**steps.out, found.metadata["largest_error_dn"]
-    away = np.abs(line[0] - np.median(line[0][used]))
-    far = used & (away > _FAR * max(step, float(np.median(away[used]))))
+    part = line[0].flat[chosen(used)]
+    usual = median(part)
+    limit = _FAR * max(step, median(np.abs(part - usual)))
+    far = used.copy()
+    for rows in blocks(far.shape):
+        far[rows] &= np.abs(line[0][rows] - usual) > limit
     few = 0 < np.count_nonzero(far) <= _FEW * np.count_nonzero(used)
     if steps.offset is not None or error <= step or not few:
         return
@@ -178,9 +184,12 @@ def refuse_far_lowest(found: Content, line: tuple[Floats, Floats], largest: floa
     InputError
         With the range.
     """
-    offset, gain = (each[usable(found.flags)] for each in line)
     # Where the correction adds to all pixels, the output may begin at 0.
-    low, high = min(0.0, float(offset.min())), float((offset + gain * largest).max())
+    low, high = 0.0, -np.inf
+    for rows in blocks(found.flags.shape):
+        offset, gain = (each[rows][usable(found.flags[rows])] for each in line)
+        low = float(np.min(offset, initial=low))
+        high = float(np.max(offset + gain * largest, initial=high))
     lowest = found.metadata["lowest"]
     if not low <= lowest <= high:
         raise InputError(
@@ -250,7 +259,7 @@ def origin(correction: Correction) -> dict[str, Any]:
     digest = hashlib.sha256()
     for array in (np.asarray(correction.coefficients, "<f8"), np.asarray(correction.flags, "<u4")):
         digest.update(f"{array.shape}".encode())
-        digest.update(np.ascontiguousarray(array).tobytes())
+        digest.update(np.ascontiguousarray(array).data)
     sensor = sensor_table(correction.metadata)
     return {
         "equipix": __version__,

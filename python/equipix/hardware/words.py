@@ -9,6 +9,7 @@ import numpy as np
 
 from equipix._check import Floats, is_whole, number
 from equipix.errors import InputError
+from equipix.measured.part import blocks
 
 NARROWEST, WIDEST = 8, 16
 """Widths of words, in bits."""
@@ -178,9 +179,11 @@ class Words:
 
     def outside(self, values: Floats, exponent: int) -> int:
         """Count the values that do not fit."""
-        low, high = self.limits
-        words = self.rounded(values, exponent)
-        return int(np.count_nonzero((words < low) | (words > high)))
+        (low, high), count = self.limits, 0
+        for part in blocks((len(values), 1)):
+            words = self.rounded(values[part], exponent)
+            count += int(np.count_nonzero((words < low) | (words > high)))
+        return count
 
     def finest(self, values: Floats, not_below: int) -> int:
         """Return the exponent of the finest step with which the largest values fit."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -37,6 +38,34 @@ def read_frames(source: str | PathLike[str] | Iterable[str | PathLike[str]]) -> 
         If a file cannot be read or differs from the first in shape or dtype.
     """
     return np.concatenate([frames for _, frames in stream_frames(source)])
+
+
+@dataclass(frozen=True)
+class FrameFiles:
+    """Frames of files, read anew, a few at a time, whenever they are asked for.
+
+    Attributes
+    ----------
+    files : tuple of Path
+        The files.
+    shape : tuple of int
+        Number of frames, rows and columns.
+    dtype : dtype
+        Of the numbers in the files.
+    """
+
+    files: tuple[Path, ...]
+    shape: tuple[int, int, int]
+    dtype: np.dtype[Any]
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return self.shape[0]
+
+    def __iter__(self) -> Iterator[NDArray[Any]]:
+        """Give one frame after the other, shape (rows, cols)."""
+        for _, frames in stream_frames(self.files):
+            yield from frames
 
 
 def stream_frames(

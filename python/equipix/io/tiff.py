@@ -216,4 +216,7 @@ def _image_or_stack(path: Path, name: str, images: Sequence[Any]) -> NDArray[Any
             f"{path}: is damaged: the pages named '{name}' are numbered {numbers}, expected each"
             f" number from 0 with their count {len(images)}"
         )
-    return np.stack([image.asarray() for image in images])
+    stack = np.empty((len(images), *images[0].shape), images[0].dtype)
+    for image, page in zip(stack, images, strict=True):
+        page.asarray(out=image)
+    return stack

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from equipix._check import Array, ArrayLike, Bools, Floats
 from equipix.errors import InputError
 from equipix.measured.noise import BLOCK, MEDIAN_SQUARE, block_medians, nanmedian, of_blocks
+from equipix.measured.part import median
 
 _LARGEST_PERIOD = 8
 """Most rows and columns after which a pattern repeats."""
@@ -274,6 +275,14 @@ def mean_signal(values: Array, mask: Bools | None = None) -> tuple[Floats, tuple
     total = np.sum(values[middle], axis=0, dtype=np.float64, where=known)
     with np.errstate(invalid="ignore"):
         return np.asarray(total / known.sum(axis=0)), (row, col)
+
+
+def mean_rise(values: Array) -> tuple[Floats, tuple[int, int]]:
+    """Rise of the middle of the sensor from the frame of lowest to that of highest median."""
+    medians = [median(each) for each in values]
+    low, high = int(np.argmin(medians)), int(np.argmax(medians))
+    image, corner = mean_signal(values[high : high + 1])
+    return image if low == high else image - mean_signal(values[low : low + 1])[0], corner
 
 
 def responses(colours: Colours, image: Array, corner: tuple[int, int] = (0, 0)) -> dict[str, float]:

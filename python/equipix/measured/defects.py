@@ -1,11 +1,11 @@
 """Which pixels must not be used: dead, hot, noisy, blind, unlike their neighbours."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from equipix._check import Array, Bools, ReadOnly, number, union
+from equipix._check import Array, Bools, Ints, ReadOnly, number, union
 from equipix.errors import InputError
 from equipix.measured.noise import (
     BLOCK,
@@ -16,7 +16,8 @@ from equipix.measured.noise import (
     of_blocks,
     scatter_limit,
 )
-from equipix.measured.statistics import FrameStatistics, light_of
+from equipix.measured.part import blocks, known_part, median
+from equipix.measured.statistics import FrameStatistics, Light, light_of
 from equipix.shown import Brief
 
 SIGMAS = 6.0
@@ -108,11 +109,22 @@ def dead_pixels(
     """
     dead = np.ones(signals.shape[1:], dtype=bool)
     for k, signal in enumerate(signals):
-        margin = 0.0 if models is None else SIGMAS * np.sqrt(models[k].variance(signal))
-        around = of_blocks(block_medians(signal / usual), signal.shape)
-        # A comparison with NaN is false: a missing measurement does not exclude a dead pixel.
-        dead &= ~(signal + margin >= DEAD_RESPONSE * usual * around)
+        around = block_medians(signal if np.ndim(usual) == 0 else signal / usual)
+        for rows, medians in _bands(around):
+            usual_here = usual if np.ndim(usual) == 0 else np.asarray(usual)[rows]
+            least = DEAD_RESPONSE * usual_here * of_blocks(medians, signal[rows].shape)
+            # A comparison with NaN is false: a missing measurement does not exclude a dead pixel.
+            suspects = np.nonzero(dead[rows] & ~(signal[rows] >= least))
+            value = signal[rows][suspects]
+            margin = 0.0 if models is None else SIGMAS * np.sqrt(models[k].variance(value))
+            dead[rows] = False
+            dead[rows][suspects] = ~(value + margin >= least[suspects])
     return dead
+
+
+def _bands(medians: Array) -> Iterator[tuple[slice, Array]]:
+    """Rows of each row of blocks, with the medians of these blocks."""
+    return ((slice(BLOCK * k, BLOCK * (k + 1)), medians[k : k + 1]) for k in range(len(medians)))
 
 
 def hot_pixels(dark: FrameStatistics, noise: NoiseModel | None) -> Array:
@@ -130,39 +142,47 @@ def hot_pixels(dark: FrameStatistics, noise: NoiseModel | None) -> Array:
     ndarray of bool, shape (rows, cols)
         True where the level is more than 10 standard deviations above the median (estimated by
         1.4826 times the median absolute deviation, and at least one DN or one step between values),
-        or the variance beyond what noise and rounding explain.
+        or the variance beyond what noise and rounding explain. Medians are those of 2¹⁹ pixels,
+        evenly over the sensor, where there are more.
     """
-    excess = dark.mean - np.nanmedian(dark.mean)
-    spread = max(1.0, dark.step, ROBUST * float(np.nanmedian(np.abs(excess))))
-    hot: Array = excess > HOT_SIGMAS * spread
-    frames = int(dark.count.max())
+    part = known_part(dark.mean)
+    usual = median(part)
+    spread = max(1.0, dark.step, ROBUST * median(np.abs(part - usual)))
+    hot: Bools = np.empty(dark.mean.shape, bool)
+    frames, limit, light = int(dark.count.max()), np.inf, Light()
     if noise is not None and frames > 1:
-        limit = scatter_limit(frames, sigmas=SIGMAS) * noise.largest_scatter(0.0)
-        hot |= dark.variance > _with_light(limit, light_of(dark).variance(dark.mean))
+        limit = scatter_limit(frames, sigmas=SIGMAS) * float(noise.largest_scatter(0.0))
+        light = light_of(dark)
+    for rows in blocks(hot.shape):
+        hot[rows] = dark.mean[rows] - usual > HOT_SIGMAS * spread
+        hot[rows] |= dark.variance[rows] > _with_light(limit, light.variance(dark.mean[rows]))
     return hot
 
 
 def noisy_pixels(
-    means: Array,
+    values: Array,
     variances: Array,
     frames: Sequence[int],
     noise: NoiseModel,
-    light: Iterable[Array],
+    light: Sequence[Light],
     *,
+    lowest: Array | None = None,
     times: float = 1.0,
 ) -> Bools:
     """Find pixels that scatter between frames by more than the noise explains.
 
     Parameters
     ----------
-    means, variances : ndarray, shape (n, rows, cols)
-        Dark-subtracted mean and sample variance of each exposure, in DN and DN².
+    values, variances : ndarray, shape (n, rows, cols)
+        Mean and sample variance of each exposure, in DN and DN².
     frames : sequence of int
         Number of frames of each exposure.
     noise : NoiseModel
         That of one frame of a good pixel.
-    light : iterable of ndarray, shape (rows, cols)
-        What the variances of each exposure have of light that varied between its frames, in DN².
+    light : sequence of Light
+        What the variances of each exposure have of light that varied between its frames.
+    lowest : ndarray, shape (rows, cols), optional
+        Level without light, where `values` hold it.
     times : float
         Noise above which a pixel is noisy, over that of a good pixel of its signal: with 1 all that
         is beyond chance.
@@ -172,17 +192,23 @@ def noisy_pixels(
     ndarray of bool, shape (rows, cols)
         True where this holds in every exposure that shows a scatter.
     """
-    noisy = np.ones(means.shape[1:], dtype=bool)
-    seen = np.zeros_like(noisy)
-    for mean, variance, count, shared in zip(means, variances, frames, light, strict=True):
-        if count < 2:
-            continue
-        of_chance = scatter_limit(count, sigmas=SIGMAS) * noise.largest_scatter(mean)
-        limit = np.maximum(of_chance, times**2 * noise.scatter(mean))
-        known = np.isfinite(variance) & np.isfinite(mean)
-        noisy &= ~known | (variance > _with_light(limit, shared))
-        seen |= known
-    return noisy & seen
+    noisy = np.ones(values.shape[1:], dtype=bool)
+    for rows in blocks(noisy.shape):
+        seen = np.zeros_like(noisy[rows])
+        for value, variance, count, shared in zip(values, variances, frames, light, strict=True):
+            if count < 2:
+                continue
+            known = np.isfinite(variance[rows]) & np.isfinite(value[rows])
+            seen |= known
+            # The first exposure leaves few pixels to ask the next one about.
+            asked = noisy[rows] & known
+            mean = value[rows][asked]
+            signal = mean if lowest is None else mean - lowest[rows][asked]
+            of_chance = scatter_limit(count, sigmas=SIGMAS) * noise.largest_scatter(signal)
+            limit = np.maximum(of_chance, times**2 * noise.scatter(signal))
+            noisy[rows][asked] = variance[rows][asked] > _with_light(limit, shared.variance(mean))
+        noisy[rows] &= seen
+    return noisy
 
 
 def often_rejected(missing: Array, samples: int) -> Bools:
@@ -310,14 +336,23 @@ def response_outliers(
         (dead, -1, least, highest, alive),
         (hot, 1, 1 / DEAD_RESPONSE, lowest, lowest),
     ):
-        beyond = sign * (sensitivity - limit * of_blocks(extreme, sensitivity.shape))
-        suspects = np.nonzero(beyond > 0)
-        blocks = suspects[0] // BLOCK, suspects[1] // BLOCK
-        beside = np.clip(_on_its_side(sensitivity, suspects, sign), floor[blocks], highest[blocks])
-        around = np.where(stepped[blocks], beside, usual[blocks])
+        suspects = _beyond(sensitivity, limit * extreme, sign)
+        at = suspects[0] // BLOCK, suspects[1] // BLOCK
+        beside = np.clip(_on_its_side(sensitivity, suspects, sign), floor[at], highest[at])
+        around = np.where(stepped[at], beside, usual[at])
         beyond = sign * (sensitivity[suspects] - limit * around)
         found[suspects] = beyond > SIGMAS * deviation[suspects]
     return dead, hot
+
+
+def _beyond(image: Array, limits: Array, sign: int) -> tuple[Ints, Ints]:
+    """Places of pixels below (`sign` -1) or above the limits of their blocks."""
+    found = []
+    for rows, limit in _bands(limits):
+        row, col = np.nonzero(sign * (image[rows] - of_blocks(limit, image[rows].shape)) > 0)
+        found.append((row + rows.start, col))
+    row, col = (np.concatenate(each) for each in zip(*found, strict=True))
+    return row, col
 
 
 def _usual(image: Array) -> Array:
@@ -401,36 +436,68 @@ def blind_pixels(signals: Array, models: Sequence[NoiseModel], usual: Array | fl
     """
     limits = [SIGMAS * float(np.sqrt(model.variance(np.zeros(())))) for model in models]
     dark = np.ones(signals.shape[1:], dtype=bool)
-    light = np.full(signals.shape[1:], np.inf)
     for signal, limit in zip(signals, limits, strict=True):
         # A comparison with NaN is false: a missing measurement neither is light nor excludes it.
         dark &= ~(signal > limit)
-        light = np.minimum(light, signal / limit)
     if not dark.any():
         return dark
-    light /= usual
-    wanted = np.broadcast_to(_WELL_ABOVE / usual, dark.shape)
-    found = dark & (_between_lit(dark, light, wanted) | _between_lit(dark.T, light.T, wanted.T).T)
+    good = np.broadcast_to(usual, dark.shape)
+
+    def light(place: tuple[Ints, Ints]) -> Array:
+        """Least light of the exposures over the limit of noise, over that of a good pixel."""
+        pairs = zip(signals, limits, strict=True)
+        least = np.minimum.reduce([signal[place] / limit for signal, limit in pairs])
+        return np.asarray(least / good[place])
+
+    wanted = np.broadcast_to(_WELL_ABOVE / np.asarray(usual), dark.shape)
+    found = _between_lit(dark, light, wanted) | _between_lit(dark.T, _turned(light), wanted.T).T
     # What such pixels enclose along rows and columns is where dead rows cross dead columns, as in
     # the corners of a frame of them.
     dark &= ~found
-    edges, half = found.astype(np.float64), np.full(dark.shape, 0.5)
-    enclosed = _between_lit(dark, edges, half) & _between_lit(dark.T, edges.T, half.T).T
-    return found | (dark & enclosed)
+
+    def edges(place: tuple[Ints, Ints]) -> Array:
+        return found[place].astype(np.float64)
+
+    half = np.broadcast_to(0.5, dark.shape)
+    enclosed = _between_lit(dark, edges, half) & _between_lit(dark.T, _turned(edges), half.T).T
+    return found | enclosed
 
 
-def _between_lit(dark: Bools, light: Array, wanted: Array) -> Bools:
-    """Which dark pixels have lit ones as the nearest others of their column, on both sides."""
-    before, after = _nearest(dark, light), _nearest(dark[::-1], light[::-1])[::-1]
-    lit = (before > wanted) & (after > wanted)
-    return np.asarray(lit & (np.minimum(before, after) < np.inf))
+_Light = Callable[[tuple[Ints, Ints]], Array]
+"""Gives the light at places (rows, cols)."""
 
 
-def _nearest(dark: Bools, light: Array) -> Array:
-    """Light of the last pixel of the column that is not dark; infinite at the sensor's edge."""
-    rows = np.arange(len(dark))[:, None]
-    last = np.maximum.accumulate(np.where(dark, -1, rows), axis=0)
-    return np.where(last < 0, np.inf, np.take_along_axis(light, np.maximum(last, 0), axis=0))
+def _turned(light: _Light) -> _Light:
+    """Light at places (cols, rows)."""
+    return lambda place: light((place[1], place[0]))
+
+
+def _between_lit(dark: Bools, light: _Light, wanted: Array) -> Bools:
+    """Which dark pixels have lit ones as the nearest others of their row, on both sides.
+
+    The light beyond the edges of the sensor is infinite: one side may lie there.
+    """
+    found, pixels = np.zeros(dark.shape, bool), np.nonzero(dark)
+    row, col = pixels
+    if not row.size:
+        return found
+    # Dark pixels beside each other in a row are a run, which has one pixel before and one behind.
+    first = np.r_[True, (np.diff(row) != 0) | (np.diff(col) != 1)]
+    last = np.r_[first[1:], True]
+    run = np.cumsum(first) - 1
+    ends = (col[first] - 1, col[last] + 1)
+    before, after = (_lit_at(light, row[first], each, dark.shape[1])[run] for each in ends)
+    lit = (before > wanted[pixels]) & (after > wanted[pixels])
+    found[pixels] = lit & (np.minimum(before, after) < np.inf)
+    return found
+
+
+def _lit_at(light: _Light, row: Ints, col: Ints, cols: int) -> Array:
+    """Light at these places; infinite beyond the edges of the sensor."""
+    inside = (col >= 0) & (col < cols)
+    found = np.full(len(col), np.inf)
+    found[inside] = light((row[inside], col[inside]))
+    return found
 
 
 _WIDTH, _EVERY = 11, 2

@@ -12,11 +12,12 @@ from typing import Self
 import numpy as np
 from numpy.typing import DTypeLike
 
-from equipix._check import EXPOSURES, Array, Bools, Floats, Words
+from equipix._check import EXPOSURES, Array, Bools, Floats, Pixels, Words
 from equipix.errors import InputError
 from equipix.measured import defects
-from equipix.measured.colour import Colours, Filters, mean_signal, pattern_of, planes_of
+from equipix.measured.colour import Colours, Filters, mean_rise, mean_signal, pattern_of, planes_of
 from equipix.measured.noise import NoiseModel, photon_transfer
+from equipix.measured.part import chosen, median, spread
 from equipix.measured.saturation import Clipping, clipping_of, highest, refuse_saturated, unclipped
 from equipix.measured.statistics import STRAY, FrameStatistics, Light, light_of, same_statistics
 
@@ -151,7 +152,8 @@ class Averaged:
         clipped = clipping_of(frames)
         self.clipped = highest([self.clipped, clipped])
         self.raw &= frames.raw
-        self.values[exposure] = np.where(saturates, np.nan, frames.mean)
+        self.values[exposure] = frames.mean
+        self.values[exposure][saturates] = np.nan
         self.variances[exposure] = frames.variance
         self.saturated |= saturates
         count = int(frames.count.max())
@@ -193,9 +195,7 @@ class Averaged:
         """Colour filters of the pixels, where they are given or stand out of the values."""
         if not self._is_counted:
             return Filters.of(self.colours, *mean_signal(self.values))
-        medians = [float(np.nanmedian(each)) for each in self.values]
-        rise = self.values[int(np.argmax(medians))] - self.values[int(np.argmin(medians))]
-        return Filters.of(self.colours, rise)
+        return Filters.of(self.colours, *mean_rise(self.values))
 
     @property
     def _lowest(self) -> Floats:
@@ -203,12 +203,13 @@ class Averaged:
         shape = self.saturated.shape
         lowest = np.empty(shape)
         for plane in planes_of(None if self.filters is None else self.filters.colours, shape):
-            lowest[plane] = min(float(np.nanmedian(each[plane])) for each in self.values)
+            part = np.unravel_index(chosen(plane), shape)
+            lowest[plane] = min(median(each[part]) for each in self.values)
         return lowest
 
     @cached_property
     def noise(self) -> NoiseModel | None:
-        """Noise model of one frame, fitted over all pixels of all frames.
+        """Noise model of one frame, fitted over the pixels of all frames by `photon_transfer`.
 
         None without scatter: of single frames, and of equal ones that are not rounded.
         """
@@ -229,7 +230,10 @@ class Averaged:
         """Points of the photon-transfer curve of each dark, at signal 0."""
         free = (each.saturated == 0 for each in self.darks)
         pairs = zip(self.darks, free, strict=True)
-        return [_points(d, np.zeros(d.mean.shape), usable, light_of(d)) for d, usable in pairs]
+        return [
+            _points(d, np.broadcast_to(0.0, d.mean.shape), usable, light_of(d))
+            for d, usable in pairs
+        ]
 
     @cached_property
     def _beside_least(self) -> list[float]:
@@ -248,13 +252,13 @@ class Averaged:
         """The dark that was subtracted from all; None of several."""
         return self._first_dark if len(set(self._shares)) <= 1 else None
 
-    def raw_values(self, exposure: int) -> Array:
-        """Mean of an exposure before the dark was subtracted."""
-        values: Array = self.values[exposure]
+    def raw_values(self, exposure: int, pixels: Pixels = ...) -> Array:
+        """Mean of an exposure before the dark was subtracted, of all pixels or of some."""
+        values: Array = self.values[exposure][pixels]
         if not self.darks:
-            return values if self.black is None else values + self.black
+            return values if self.black is None else values + self.black[pixels]
         pairs = zip(self._shares[exposure], self.darks, strict=True)
-        return np.asarray(values + sum(share * dark.mean for share, dark in pairs))
+        return np.asarray(values + sum(share * dark.mean[pixels] for share, dark in pairs))
 
     @property
     def unsteady(self) -> str:
@@ -321,7 +325,7 @@ class Averaged:
             )
         )
         beside = {each: np.maximum(covariance(each, each) - common, 0) for each in counts}
-        own = {each: float(np.nanmedian(variance)) for each, variance in beside.items()}
+        own = {each: median(variance) for each, variance in beside.items()}
         return common, [own[each] for each in self._shares]
 
     def bad_pixels(self, noise: NoiseModel | None) -> defects.BadPixels:
@@ -329,8 +333,9 @@ class Averaged:
         noisy = None
         if noise is not None:
             noise = _noisier(noise, max(self._beside_least, default=0.0))
-            light = map(Light.variance, self.light, self.values)
-            noisy = defects.noisy_pixels(self._signals, self.variances, self.frames, noise, light)
+            measured = self.values, self.variances, self.frames
+            lowest = self._lowest if self._is_counted else None
+            noisy = defects.noisy_pixels(*measured, noise, self.light, lowest=lowest)
             if self._screened:
                 noisy |= defects.often_rejected(self._missing, self._screened)
         hot = np.zeros(self.saturated.shape, bool)
@@ -350,22 +355,22 @@ class Averaged:
         models = None
         if noise is not None:
             of_dark = self.dark_variance(noise)
-            models = self.models(noise, 0.0 if of_dark is None else float(np.median(of_dark)))
-        measured = np.isfinite(self.values).any(axis=0)
+            models = self.models(noise, 0.0 if of_dark is None else median(of_dark))
         usual = 1.0 if self.filters is None else self.filters.map_of(self.saturated.shape)
-        dead: Bools = defects.dead_pixels(self._signals, models, usual)
+        signals = self.values - self._lowest if self._is_counted else self.values
+        dead: Bools = defects.dead_pixels(signals, models, usual)
         if models is not None:
-            dead |= defects.blind_pixels(self._signals, models, usual)
+            dead |= defects.blind_pixels(signals, models, usual)
+        measured = np.zeros_like(dead)
+        for each in self.values:
+            measured |= np.isfinite(each)
         return dead & measured
-
-    @property
-    def _signals(self) -> Array:
-        """Values above the level without light, as far as it is known."""
-        return self.values - self._lowest if self._is_counted else self.values
 
 
 def _refuse_no_variance(which: str, frames: FrameStatistics) -> None:
     """Refuse averages of several samples without a finite variance that is not negative."""
+    if frames.variance.min() >= 0 and frames.variance.max() < np.inf:
+        return  # usually: then no map is made
     several = (frames.count > 1) & np.isfinite(frames.mean)
     wrong = several & ~(np.isfinite(frames.variance) & (frames.variance >= 0))
     if wrong.any():
@@ -379,7 +384,11 @@ def _added_by_dark(frames: FrameStatistics, count: int) -> float:
     """Variance that a dark adds to the mean, as `variance_of_mean` has it: its median."""
     if count < 2:
         return 0.0
-    return max(0.0, float(np.nanmedian(frames.variance_of_mean - frames.variance / count)))
+    part = spread(frames.mean.size)
+    of_mean, of_frame = (
+        each.reshape(-1)[part] for each in (frames.variance_of_mean, frames.variance)
+    )
+    return max(0.0, median(of_mean - of_frame / count))
 
 
 def _noisier(noise: NoiseModel, added: float) -> NoiseModel:
@@ -417,5 +426,6 @@ def _points(
     period: tuple[int, int] = (1, 1),
 ) -> Array:
     """Points of the photon-transfer curve of the pixels that are `free` of saturation."""
-    common, count = light.variance(frames.mean), int(frames.count.max())
+    common = None if light == Light() else light.variance(frames.mean)
+    count = int(frames.count.max())
     return photon_transfer(signal, frames.variance, free, count, frames.step, common, period)

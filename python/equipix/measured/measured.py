@@ -14,6 +14,7 @@ from equipix._check import (
     Bools,
     Floats,
     Ints,
+    Pixels,
     ReadOnly,
     Words,
     as_array,
@@ -120,12 +121,15 @@ class Measured(ReadOnly):
             return self.noise[exposure].variance(signal)
         return None if self.variance is None else np.asarray(self.variance[exposure])
 
-    def raw_values(self, exposure: int) -> Array:
-        """Values of an exposure before the dark was subtracted; NaN where they saturate."""
-        values: Array = self.values[exposure]
+    def raw_values(self, exposure: int, pixels: Pixels = ...) -> Array:
+        """Values of an exposure, or of some of its pixels, before the dark was subtracted.
+
+        NaN where they saturate.
+        """
+        values: Array = self.values[exposure][pixels]
         if self.mask is not None and self.mask.ndim == 3:
-            values = np.where(self.mask[exposure], np.nan, values)
-        return values if self.dark is None else values + self.dark
+            values = np.where(self.mask[exposure][pixels], np.nan, values)
+        return values if self.dark is None else values + self.dark[pixels]
 
     def weighted(self, variance: Array | None) -> Self:
         """Return the exposures with other variances."""
@@ -209,7 +213,7 @@ def _of_averaged(
         bad_pixels=bad_pixels,
         saturation=averaged.saturation,
         clipped=averaged.clipped,
-        dark=None if dark is None else dark.astype(averaged.values.dtype),
+        dark=None if dark is None else dark.astype(averaged.values.dtype, copy=False),
         dark_variance=None if model is None else averaged.dark_variance(model),
         raw=averaged.raw,
         unsteady=averaged.unsteady,

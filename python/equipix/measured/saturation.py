@@ -61,9 +61,7 @@ def clipping(values: Array, crowded: float = _CROWDED, step: float = 0.0) -> Cli
     clips them: then all above it are at it. Where most values are at it, an even scene does the
     same, and only the largest number of some bits is taken for a level.
     """
-    # Most exposures are finite and end here: nothing is copied for them.
-    finite = values.size > 0 and np.isfinite([values.min(), values.max()]).all()
-    known = values if finite else values[np.isfinite(values)]
+    known = _known(values)
     if known.size <= _MANY:
         return None
     top = float(known.max())
@@ -79,6 +77,12 @@ def clipping(values: Array, crowded: float = _CROWDED, step: float = 0.0) -> Cli
         return None
     level = whole(top)
     return Clipping(level, count) if 2 * count < known.size or is_of_bits(level) else None
+
+
+def _known(values: Array) -> Array:
+    """Values that are finite: of most exposures all, of which no copy is made."""
+    finite = values.size > 0 and np.isfinite([values.min(), values.max()]).all()
+    return values if finite else values[np.isfinite(values)]
 
 
 def whole(top: float) -> float:
@@ -98,7 +102,7 @@ def plateau(values: Array) -> Clipping | None:
 
     What an even scene does is none: most values are in a plateau then, or it is wider.
     """
-    known = values[np.isfinite(values)]
+    known = _known(values)
     top = float(known.max()) if known.size > _MANY else 0.0
     if top < _FINE:
         return None
@@ -119,10 +123,12 @@ def clipping_of(frames: FrameStatistics) -> Clipping | None:
     missing from few other pixels, those at the level need not be compared with those just below,
     which contain the pixels that saturate in some frames only.
     """
-    raw = np.where(frames.saturated > 0, np.nan, _raw_mean(frames))
-    found = clipping(raw, crowded=0.0)
+    raw = _raw_mean(frames)
+    known = raw[(frames.saturated == 0) & np.isfinite(raw)]
+    found = clipping(known, crowded=0.0)
     if found is None:
-        return plateau(raw)
+        return plateau(known)
+    raw = np.where(frames.saturated > 0, np.nan, raw)
     steady = frames.variance == 0
     others = np.isfinite(raw) & (raw < found.level * (1 - ROUNDING))
     if np.count_nonzero(steady & ~others) >= _MANY and np.mean(steady[others]) < _RARE:

@@ -27,6 +27,7 @@ from equipix.io.formats import FrameFile, refuse_saved
 from equipix.io.record import Counts, Doubles, Record, read_record
 from equipix.io.viewed import Viewed
 from equipix.measured.noise import scatter_limit, step_of
+from equipix.measured.part import median
 
 _MAPS = ("mean", "variance", "variance_of_mean", "count", "saturated")
 
@@ -188,7 +189,7 @@ def _on_bright_dark(statistics: FrameStatistics) -> str | None:
     """Say that a dark is not that of the frames, or was subtracted from them before."""
     if statistics.dark is None or not np.isfinite(statistics.mean).any():
         return None
-    level, below = np.nanmedian(statistics.dark.mean), -np.nanmedian(statistics.mean)
+    level, below = median(statistics.dark.mean), -median(statistics.mean)
     if level > 0 and below > DARKER * level:
         return (
             f"the frames are darker than 'dark' by {below:.4g} of {level:.4g} DN in the median "
@@ -287,10 +288,14 @@ def light_of(frames: FrameStatistics) -> Light:
     known = np.isfinite(frames.mean) & np.isfinite(frames.variance)
     if frames.light_variance is None or count < 2 or not known.any():
         return Light()
+    variance = frames.light_variance
+    if known.all() and frames.count.min() == count:  # usually: then no map is made
+        samples = float(known.size)
+        if variance <= scatter_limit(count) * (float(frames.variance.sum()) / samples) / samples:
+            return Light()
     share = np.where(known, frames.count / count, 0)
     samples = float(share.sum())
     scatter = float((share[known] * frames.variance[known]).sum()) / samples
-    variance = frames.light_variance
     if variance <= scatter_limit(count) * scatter / samples:
         return Light()
     follows = known & (frames.saturated == 0)

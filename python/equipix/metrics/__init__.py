@@ -2,7 +2,6 @@
 
 from equipix.metrics.correctability import correctability, validity_interval
 from equipix.metrics.emva import emva_spatial, emva_transfer
-from equipix.metrics.frame_noise import three_d_noise
 from equipix.metrics.maps import (
     block_means,
     netd,
@@ -11,6 +10,7 @@ from equipix.metrics.maps import (
     relative_error,
     roughness,
 )
+from equipix.metrics.three_d import three_d_noise
 
 __all__ = [
     "block_means",

@@ -6,10 +6,11 @@ from statistics import NormalDist
 
 import numpy as np
 
-from equipix._check import ArrayLike, Bools, Floats, as_array, as_mask, naming_memory, number
+from equipix._check import ArrayLike, as_array, as_mask, naming_memory, number
 from equipix.errors import InputError
-from equipix.findings import Finding, ask, say
-from equipix.metrics.frame_noise import STEADY, signed_root, stack_of, temporal_of
+from equipix.findings import Finding, Findings, ask, say
+from equipix.metrics.frame_noise import STEADY, signed_root, stack_of, used_in
+from equipix.metrics.sums import Sums
 from equipix.shown import Brief
 
 
@@ -120,26 +121,32 @@ def correctability(
     True
     """
     stack = stack_of("frames", frames)
+    sums = Sums(used_in(stack, as_mask(mask, stack.shape[1:])))
+    for frame in stack:
+        sums.add(frame)
+    return judged(sums, confidence, say(*ask(STEADY, sums.steadiness)))
+
+
+def judged(sums: Sums, confidence: float = 0.95, said: Findings = ()) -> Correctability:
+    """Spatial over temporal noise from sums over frames; `said` are its findings."""
     if not 0 < number("confidence", confidence) < 1:
         raise InputError(f"'confidence' is {confidence!r}, expected a number between 0 and 1")
-    found = temporal_of(stack, as_mask(mask, stack.shape[1:]))
-    said = say(*ask(STEADY, found))
-    n, pixels = found.frames, int(np.count_nonzero(found.used))
+    n, pixels = len(sums.levels), sums.pixels
     if pixels < 2:
         raise InputError(f"'frames' has {pixels} pixels that are finite and not masked, expected 2")
     # A frame's own mean takes one of N degrees of freedom.
-    temporal = float(found.variance[found.used].mean()) * pixels / (pixels - 1)
+    temporal = sums.noise_squares / (n - 1) / (pixels - 1)
     if temporal <= 0:
         raise InputError("'frames' are all equal: they show no temporal noise")
-    spatial = float(found.mean[found.used].var(ddof=1)) - temporal / n
+    spatial = sums.spatial_variance() - temporal / n
     ratio = n * spatial / temporal + 1
-    degrees = _freedom(found.mean, found.used), (pixels - 1) * (n - 1)
+    degrees = _freedom(sums), (pixels - 1) * (n - 1)
     tail = (1 - confidence) / 2
     low, high = (
         signed_root((ratio / fisher_quantile(p, *degrees) - 1) / n) for p in (1 - tail, tail)
     )
     figures = signed_root(spatial / temporal), low, high, spatial, temporal, pixels, n
-    return Correctability(*figures, float(found.mean[found.used].mean()), said)
+    return Correctability(*figures, sums.centre, said)
 
 
 def validity_interval(times: ArrayLike, ratios: ArrayLike) -> float:
@@ -185,17 +192,12 @@ def validity_interval(times: ArrayLike, ratios: ArrayLike) -> float:
     return float(when[first - 1] + share * (when[first] - when[first - 1]))
 
 
-def _freedom(image: Floats, used: Bools) -> float:
+def _freedom(sums: Sums) -> float:
     """Degrees of freedom f of the variance over pixels, as of `correctability`."""
-    away = np.where(used, image - image[used].mean(), 0.0)
-    total, left = float(np.sum(away**2)), np.count_nonzero(used) - 1
+    total, parts = sums.between_lines()
+    left = sums.pixels - 1
     if total == 0:
         return float(left)
-    parts = []
-    for axis in (0, 1):
-        counts, sums = used.sum(axis=axis), away.sum(axis=axis)
-        freedom = np.count_nonzero(counts) - 1
-        parts.append((float(np.sum(sums[counts > 0] ** 2 / counts[counts > 0])), freedom))
     rest = max(0.0, total - sum(square for square, _ in parts))
     parts.append((rest, left - sum(freedom for _, freedom in parts)))
     return total**2 / sum(square**2 / freedom for square, freedom in parts if freedom > 0)

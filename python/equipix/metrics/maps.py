@@ -9,6 +9,7 @@ from equipix._check import Array, ArrayLike, Bools, Floats, as_array, naming_mem
 from equipix.errors import InputError
 from equipix.measured.colour import Colours, planes_of
 from equipix.measured.noise import BLOCK, nanmedian, scatter_limit
+from equipix.measured.part import blocks
 from equipix.metrics.frame_noise import stack_of, temporal_of
 
 
@@ -273,12 +274,19 @@ def roughness(frame: ArrayLike) -> float:
     >>> metrics.roughness([[1.0, 1.0], [1.0, 2.0]])
     0.4
     """
-    image = as_array("frame", frame, ndim=2).astype(np.float64)
-    size = float(np.nansum(np.abs(np.where(np.isfinite(image), image, np.nan))))
+    image = as_array("frame", frame, ndim=2)
+    size, steps = 0.0, [0.0, 0.0]
+    for rows in blocks(image.shape):
+        # The block, and the row before it: a step lies between two rows.
+        part = image[max(0, rows.start - 1) : rows.stop].astype(np.float64)
+        own = part[-(rows.stop - rows.start) :]
+        for axis, values in enumerate((part, own)):
+            away = np.abs(np.diff(values, axis=axis))
+            steps[axis] += float(np.sum(away[np.isfinite(away)]))
+        size += float(np.sum(np.abs(own[np.isfinite(own)])))
     if not size > 0:
         raise InputError("'frame' holds no finite value other than 0")
-    steps = (np.abs(np.diff(image, axis=axis)) for axis in (0, 1))
-    return float(sum(np.sum(each[np.isfinite(each)]) for each in steps)) / size
+    return sum(steps) / size
 
 
 def planes(frames: ArrayLike, cfa: ArrayLike | Colours) -> dict[str, Array]:

@@ -12,6 +12,7 @@ from equipix.findings import ask, say, set_bits, usable
 from equipix.io.record import made, now
 from equipix.measured.means import Averaged
 from equipix.measured.noise import NoiseModel, median_of_noise
+from equipix.measured.part import blocks, median
 from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.curves import horner_inverse, least_slope
 from equipix.nuc.level_rules import CURVES, INVERSE, Curves, inverse_error
@@ -222,23 +223,30 @@ def _curves(levels: Levels, order: int, by: By, workers: int | None) -> dict[str
     spare = len(levels) - (order + 1)
     cleaned = _of_alike_pixels(levels, found[2], spare) if order > 0 and spare > 0 else None
     if cleaned is not None:
+        del found  # before the next maps are made
         levels, found = cleaned, cleaned.fit(order, by, workers=workers)
     deviation, variances, misfit, used = found
-    freedom = used.astype(np.int64) - (order + 1)
-    chi2 = np.where(freedom > 0, misfit / np.maximum(freedom, 1), np.nan)
     if levels.level_noise is None:
-        variances = variances * _pooled(misfit, freedom, levels.good)
-    variances = _with_dark(variances, levels, by if order == 0 else "offset")
+        variances *= _pooled(misfit, used, order + 1, levels.good)
+    _add_dark(variances, levels, by if order == 0 else "offset")
     limits = levels.limits()
-    rising = least_slope(deviation, limits) > 0
-    inverse, difference = horner_inverse(np.where(rising, deviation, np.nan), limits)
+    rising, difference = np.empty(used.shape, bool), np.empty(used.shape)
+    inverse = np.empty((2 if order < 2 else 4, *used.shape))
+    for rows in blocks(used.shape):
+        curves, ends = deviation[:, rows], limits[:, rows]
+        rising[rows] = least_slope(curves, ends) > 0
+        usable_curves = np.where(rising[rows], curves, np.nan)
+        inverse[:, rows], difference[rows] = horner_inverse(usable_curves, ends)
+        freedom = used[rows].astype(np.int64) - (order + 1)
+        reduced = misfit[rows] / np.maximum(freedom, 1)
+        misfit[rows] = np.where(freedom > 0, reduced, np.nan)
     return {
         "deviation": deviation,
         "variances": variances,
         "inverse": inverse,
         "inverse_error": difference,
         "limits": limits,
-        "reduced_chi2": chi2,
+        "reduced_chi2": misfit,
         "used": used,
         "rising": rising,
         "levels": levels.references,
@@ -270,35 +278,34 @@ def _of_alike_pixels(levels: Levels, misfit: Floats, freedom: int) -> Levels | N
     noise of a value, which add 1 % to χ², pass.
     """
     rounding = (_ROUNDING * np.abs(levels.references).max()) ** 2 / levels.variances.min()
-    squares = np.maximum(misfit[levels.good], len(levels) * rounding)[None]
+    squares = misfit[levels.good][None]
+    np.maximum(squares, len(levels) * rounding, out=squares)
     alike = alike_pixels(squares)
     if alike.all():
         return None
     cleaned = levels.counting(alike)
-    typical = np.median(squares) / (freedom * median_of_noise(np.array(freedom)))
+    typical = median(squares) / (freedom * median_of_noise(np.array(freedom)))
     noise = levels.variances if levels.level_noise else typical
     moved = (cleaned.references - levels.references) ** 2
     return cleaned if np.any(moved > _MOST_MOVED * noise) else None
 
 
-def _pooled(misfit: Floats, freedom: Array, usable: Array) -> float:
+def _pooled(misfit: Floats, used: Array, coefficients: int, usable: Array) -> float:
     """Variance of a value from the residuals of all good pixels; NaN without freedom."""
-    total = int(freedom[usable].sum())
+    total = int((used[usable].astype(np.int64) - coefficients).sum())
     return float(misfit[usable].sum()) / total if total > 0 else float("nan")
 
 
-def _with_dark(variances: Floats, levels: Levels, by: By) -> Floats:
+def _add_dark(variances: Floats, levels: Levels, by: By) -> None:
     """Add the noise of the dark, which changes all values of a pixel by the same amount."""
     if levels.dark_variance is None:
-        return variances
-    variances = variances.copy()
+        return
     if by == "offset":
         variances[0] += levels.dark_variance
-        return variances
+        return
     weighted = levels.references / levels.variances
     factor = weighted.sum() / (weighted @ levels.references)
     variances[1] += levels.dark_variance * factor**2
-    return variances
 
 
 def _flags(deviation: Floats, levels: Levels, rising: Array) -> Array:

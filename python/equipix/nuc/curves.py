@@ -3,8 +3,10 @@
 from math import comb
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from equipix._check import Array, Floats
+from equipix.measured.part import blocks
 
 
 def response_at(deviation: Array, mean: Array | float) -> Floats:
@@ -68,12 +70,16 @@ def polynomial(coefficients: Array, x: Array | float) -> Floats:
     return total
 
 
-def counted_from(coefficients: Array, dark: Array) -> Floats:
-    """Coefficients d of Σ d_j y^j = Σ c_j (y − dark)^j."""
-    moved: Floats = np.zeros(coefficients.shape)
-    for power, coefficient in enumerate(coefficients):
-        for lower in range(power + 1):
-            moved[lower] += comb(power, lower) * coefficient * (-dark) ** (power - lower)
+def counted_from(coefficients: Array, dark: Array, dtype: DTypeLike = np.float64) -> Array:
+    """Coefficients d of Σ d_j y^j = Σ c_j (y − dark)^j, rounded to a dtype at last."""
+    moved: Array = np.empty(coefficients.shape, dtype)
+    for rows in blocks(dark.shape):
+        block: Floats = np.zeros(coefficients[:, rows].shape)
+        for power, coefficient in enumerate(coefficients[:, rows]):
+            for lower in range(power + 1):
+                shift = (-dark[rows]) ** (power - lower)
+                block[lower] += comb(power, lower) * coefficient * shift
+        moved[:, rows] = block
     return moved
 
 

@@ -9,9 +9,11 @@ from equipix._check import Array, Bools, Floats, ReadOnly, check_type, naming_me
 from equipix.correction.protocol import named_cfa
 from equipix.errors import InputError
 from equipix.findings import Finding, Findings, ask, say, set_bits, usable
+from equipix.io.frames import FrameFiles
 from equipix.measured import defects, noise
 from equipix.measured.colour import Colours, Filters, planes_of
 from equipix.measured.defects import DefectLimits
+from equipix.measured.part import blocks, known_part, spread
 from equipix.measured.statistics import FrameStatistics, Light, light_of
 from equipix.metrics.frame_noise import STEADY, stack_of, temporal_of
 from equipix.nuc.curves import response_at
@@ -65,17 +67,24 @@ def _range(response: Response) -> Floats:
     low, high = response.limits
     whole = np.zeros(response.shape)
     for plane in planes_of(response.cfa, response.shape):
-        known = plane & np.isfinite(high - low)
+        known = plane & np.isfinite(low) & np.isfinite(high)
         if known.any():
-            whole[plane] = high[known].max() - low[known].min()
+            ends = (
+                np.max(high, where=known, initial=-np.inf),
+                np.min(low, where=known, initial=np.inf),
+            )
+            whole[plane] = ends[0] - ends[1]
     return whole
 
 
 def of_frames(
-    frames: ArrayLike | FrameStatistics, good: Bools, limits: DefectLimits, cfa: Colours | None
+    frames: ArrayLike | FrameFiles | FrameStatistics,
+    good: Bools,
+    limits: DefectLimits,
+    cfa: Colours | None,
 ) -> tuple[dict[str, Bools], Findings]:
     """Bad pixels by their noise, and what limits it; `good` are those whose curves are usable."""
-    slow, light = None, Light()
+    steps, light = None, Light()
     said: Findings = ()
     given = frames.mean if isinstance(frames, FrameStatistics) else stack_of("frames", frames)
     if given.shape[-2:] != good.shape:
@@ -85,33 +94,35 @@ def of_frames(
         step, light = frames.step, light_of(frames)
     else:
         over_time = temporal_of(given, ~good)
-        said = say(*ask(STEADY, over_time))
-        mean, variance, count = over_time.mean, over_time.variance, over_time.frames
-        step = noise.step_of(given.reshape(len(given), -1)[:, :: -(-given[0].size // _SAMPLED)])
-        slow = defects.flickering_pixels(over_time.steps, variance, count, limits.correlation)
+        said = say(*ask(STEADY, over_time.steadiness))
+        mean, variance, steps, _, count, _ = over_time
+        sampled = np.unravel_index(spread(good.size, _SAMPLED), good.shape)
+        step = noise.step_of(np.array([frame[sampled] for frame in given]))
     if count < 2:
         raise InputError("'frames' holds one frame, expected two or more: one shows no noise")
-    common = light.variance(mean)
+    common = None if light == Light() else light.variance(mean)
     period = (1, 1) if cfa is None else cfa.period
     model = _common_noise(mean, variance, good, count, step, common, period)
-    noisy = flickering = np.zeros(good.shape, bool)
+    noisy, flickering = np.zeros((2, *good.shape), bool)
     if model is not None:
         of_level = mean[None], variance[None], [count], model
-        flickering = defects.noisy_pixels(*of_level, [np.zeros(())])
-        noisy = defects.noisy_pixels(*of_level, [common], times=limits.noise)
+        flickering = defects.noisy_pixels(*of_level, [Light()])
+        noisy = defects.noisy_pixels(*of_level, [light], times=limits.noise)
     if isinstance(frames, FrameStatistics) and frames.reject is not None:
         missing = np.where(frames.count > 0, count - frames.count.astype(np.int64), 0)
         noisy = noisy | defects.often_rejected(missing, count)
     found = {"noisy": noisy}
-    if slow is not None:
-        found["flickering"] = flickering & slow
+    if steps is not None:
+        of_pixels = steps[flickering], variance[flickering]
+        flickering[flickering] = defects.flickering_pixels(*of_pixels, count, limits.correlation)
+        found["flickering"] = flickering
     return found, said
 
 
 def too_few_for_flicker(frames: object, limits: DefectLimits) -> dict[str, str]:
     """Say that frames are too few to find flicker, if they are."""
+    count = len(frames if isinstance(frames, FrameFiles) else np.asarray(frames))
     needed = int(np.ceil((limits.correlation / _CORRELATED) ** 2 - 2))
-    count = len(np.asarray(frames))
     return {"flickering": f"below {needed} frames"} if count < needed else {}
 
 
@@ -127,10 +138,13 @@ def _dead(response: Response, slope: Floats, usual: Floats | float, least: float
 def _nonlinear(response: Response, sigmas: float, misfit: float) -> Bools:
     """Pixels whose curve fits worse than noise, and the misfit of the array, explain."""
     found = np.zeros(response.shape, bool)
-    common = sigmas**2 * max(0.0, misfit - 1) / noise.MEDIAN_SQUARE
-    for freedom in np.unique(response.freedom[response.freedom > 0]):
-        limit = noise.scatter_limit(int(freedom) + 1, sigmas=sigmas) + common
-        found |= (response.freedom == freedom) & (response.reduced_chi2 > limit)
+    common, freedoms = sigmas**2 * max(0.0, misfit - 1) / noise.MEDIAN_SQUARE, response.freedom
+    limits = [
+        noise.scatter_limit(freedom + 1, sigmas=sigmas) + common if freedom else np.inf
+        for freedom in range(len(response.levels) + 1)
+    ]
+    for rows in blocks(response.shape):
+        found[rows] = response.reduced_chi2[rows] > np.array(limits)[freedoms[rows]]
     return found
 
 
@@ -140,7 +154,7 @@ def _common_noise(
     good: Bools,
     count: int,
     step: float,
-    light: Array,
+    light: Array | None,
     period: tuple[int, int],
 ) -> noise.NoiseModel | None:
     """Noise that pixels of a signal have in common; None of equal frames that are not rounded."""
@@ -171,7 +185,8 @@ class Defects(ReadOnly):
         Pixels of each kind; one pixel may be of several. ``"unusable"`` counts all that are flagged
         ``DO_NOT_USE``. A kind that is not determinable has no number here.
     gain_percentiles : dict of str to float
-        Distribution of K over the pixels that are determined: percentiles by their names.
+        Distribution of K over the pixels that are determined, of 2¹⁹ of them, evenly over the
+        sensor, where there are more: percentiles by their names.
     misfit : float
         Reduced χ² that half of the usable pixels exceed, over that of noise alone: about 1 if the
         curves are of this order. NaN where no noise was known, or no level is left over.
@@ -195,7 +210,7 @@ class Defects(ReadOnly):
 
 def find_defects(
     response: Response,
-    frames: ArrayLike | FrameStatistics | None = None,
+    frames: ArrayLike | FrameFiles | FrameStatistics | None = None,
     *,
     cfa: ArrayLike | None = None,
     limits: DefectLimits | None = None,
@@ -294,8 +309,7 @@ def find_defects(
     few = too_few_for_flicker(frames, limits) if "flickering" in found else {}
     counts = {kind: int(np.count_nonzero(each)) for kind, each in found.items() if kind not in few}
     counts["unusable"] = int(np.count_nonzero(~usable(flags)))
-    gain = slope - 1
-    known = gain[np.isfinite(gain)]
+    known = known_part(slope) - 1
     percentiles = np.percentile(known, PERCENTILES) if known.size else np.full(len(PERCENTILES), 0)
     named = {f"{name:g}": float(each) for name, each in zip(PERCENTILES, percentiles, strict=True)}
     said += say(*ask(CURVES, Curves(response, misfit)))

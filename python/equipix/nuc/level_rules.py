@@ -12,6 +12,7 @@ from equipix.measured.defects import SIGMAS
 from equipix.measured.means import Averaged
 from equipix.measured.measured import Measured
 from equipix.measured.noise import inliers, scatter_limit
+from equipix.measured.part import blocks, chosen
 from equipix.measured.saturation import ROUNDING, Clipping, clipping_advice, is_of_bits, whole
 from equipix.nuc.response import Response
 
@@ -69,35 +70,39 @@ def _on_saturation(given: Given) -> str | None:
 
 def _at_highest(measured: Measured) -> tuple[float, list[float]]:
     """Highest finite raw value of all levels, and the share of each level's pixels there."""
-    tops = [_highest(measured.raw_values(level)) for level in range(len(measured))]
+    tops = [_highest(measured, level) for level in range(len(measured))]
     top = max(tops)
     if not np.isfinite(top) or top <= 0 or measured.values[0].size < _FEWEST_JUDGED:
         return top, [0.0] * len(tops)
     least = top * (1 - ROUNDING)
     return whole(top), [
-        _share(measured.raw_values(level), least) if each >= least else 0.0
-        for level, each in enumerate(tops)
+        _share(measured, level, least) if each >= least else 0.0 for level, each in enumerate(tops)
     ]
 
 
-def _highest(raw: Array) -> float:
-    """Largest finite value, or minus infinity."""
-    return float(np.max(raw, initial=-np.inf, where=np.isfinite(raw)))
+def _highest(measured: Measured, level: int) -> float:
+    """Largest finite value of a level, or minus infinity."""
+    every = (measured.raw_values(level, rows) for rows in blocks(measured.shape))
+    return float(max(np.max(raw, initial=-np.inf, where=np.isfinite(raw)) for raw in every))
 
 
-def _share(raw: Array, least: float) -> float:
-    """Share of the finite values that are `least` or more."""
-    known = np.isfinite(raw)
-    count = int(np.count_nonzero(known))
-    return int(np.count_nonzero(known & (raw >= least))) / max(1, count)
+def _share(measured: Measured, level: int, least: float) -> float:
+    """Share of the finite values of a level that are `least` or more."""
+    count = above = 0
+    for rows in blocks(measured.shape):
+        raw = measured.raw_values(level, rows)
+        known = np.isfinite(raw)
+        count += int(np.count_nonzero(known))
+        above += int(np.count_nonzero(known & (raw >= least)))
+    return above / max(1, count)
 
 
 def _others_differ(measured: Measured, crowded: Sequence[int]) -> bool:
     """Whether another level has most of its pixels below its highest value."""
     for level in set(range(len(measured))) - set(crowded):
-        raw = measured.raw_values(level)
-        top = _highest(raw)
-        if np.isfinite(top) and _share(raw, top - ROUNDING * abs(top)) <= _MOST_AT_HIGHEST:
+        top = _highest(measured, level)
+        least = top - ROUNDING * abs(top)
+        if np.isfinite(top) and _share(measured, level, least) <= _MOST_AT_HIGHEST:
             return True
     return False
 
@@ -117,6 +122,10 @@ _TAIL = 0.01
 """Share of the pixels beyond the ends of a level's values."""
 
 
+_Pixels = tuple[Array, ...]
+"""Rows and columns of pixels."""
+
+
 class _Scatter(NamedTuple):
     """Mean value of a level, and the temporal variance of one frame."""
 
@@ -134,7 +143,7 @@ def _on_full_wells(given: Given) -> str | None:
     -----
     Saturation is where the temporal variance has its maximum [1]_: a full well loses what exceeds
     it. A drift of the light in the frames of the darker level would look the same, so what all of
-    its pixels may have in common does not count.
+    its pixels may have in common does not count. 2¹⁹ pixels, evenly over the sensor, are asked.
 
     References
     ----------
@@ -143,8 +152,8 @@ def _on_full_wells(given: Given) -> str | None:
     averaged = given.averaged
     if averaged is None:
         return None
-    used = _used(averaged, given.mask)
-    if np.count_nonzero(used) < _FEWEST_JUDGED:
+    used = np.unravel_index(chosen(_used(averaged, given.mask)), averaged.saturated.shape)
+    if used[0].size < _FEWEST_JUDGED:
         return None
     lowest = averaged.values[int(np.argmin([each[used].mean() for each in averaged.values]))][used]
     scatters = [
@@ -172,19 +181,21 @@ def _noisier(bright: _Scatter, scatters: list[_Scatter]) -> list[_Scatter]:
 
 def _used(averaged: Averaged, mask: Bools | None) -> Bools:
     """Pixels with a value and a variance at every level, so that gains are the same at all."""
-    known = np.isfinite(averaged.values) & np.isfinite(averaged.variances)
-    used = np.asarray(known.all(axis=0))
+    used = np.ones(averaged.saturated.shape, bool)
+    for value, variance in zip(averaged.values, averaged.variances, strict=True):
+        used &= np.isfinite(value)
+        used &= np.isfinite(variance)
     return used if mask is None else used & ~mask.reshape(-1, *used.shape).any(axis=0)
 
 
-def _scatter(averaged: Averaged, level: int, used: Bools, lowest: Array) -> _Scatter:
+def _scatter(averaged: Averaged, level: int, used: _Pixels, lowest: Array) -> _Scatter:
     """Noise of a level, with its bound."""
     frames = averaged.frames[level]
     variances = averaged.variances[level][used].astype(np.float64)
     rise = averaged.values[level][used].astype(np.float64) - lowest
     kept = inliers(variances, scatter_limit(frames))
     common = _common(variances[kept], rise[kept], frames - 1)
-    mean, variance = averaged.raw_values(level)[used].mean(), float(variances[kept].mean())
+    mean, variance = averaged.raw_values(level, used).mean(), float(variances[kept].mean())
     return _Scatter(level, float(mean), variance, variance - common)
 
 
@@ -224,14 +235,14 @@ def _words(full: list[_Scatter], first: _Scatter, darker: _Scatter) -> str:
     )
 
 
-def _advice(averaged: Averaged, used: Bools, full: list[_Scatter]) -> str:
+def _advice(averaged: Averaged, used: _Pixels, full: list[_Scatter]) -> str:
     """Name the saturation level, where it is above the values of all other levels."""
     if averaged.dark is None and not averaged.raw:
         return ""  # less a dark that was not kept
     saturate = [each.level for each in full]
     free = [level for level in range(averaged.count) if level not in saturate]
-    low = min(float(np.quantile(averaged.raw_values(level)[used], _TAIL)) for level in saturate)
-    highest = max(float(np.quantile(averaged.raw_values(level)[used], 1 - _TAIL)) for level in free)
+    low = min(float(np.quantile(averaged.raw_values(level, used), _TAIL)) for level in saturate)
+    highest = max(float(np.quantile(averaged.raw_values(level, used), 1 - _TAIL)) for level in free)
     if np.floor(low) <= highest:
         return ""
     level = f"{np.floor(low):.10g}"

@@ -12,11 +12,12 @@ from equipix import _native
 from equipix._check import Array, Bools, By, Floats, Ints, Words, as_mask, union
 from equipix.errors import InputError
 from equipix.findings import Finding, Rule, ask, say
-from equipix.measured.colour import Colours, Filters
+from equipix.measured.colour import Colours, Filters, mean_rise
 from equipix.measured.defects import SIGMAS, BadPixels, response_outliers
 from equipix.measured.means import Averaged
 from equipix.measured.measured import Measured, averaged_of, check_levels, measured_of
 from equipix.measured.noise import MEDIAN_SQUARE, NoiseModel
+from equipix.measured.part import ENOUGH, chosen, known_part, median, spread
 from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.level_rules import GIVEN, Given
 
@@ -32,7 +33,7 @@ _ROUNDING = 1e-9
 """Relative difference below which two means are equal, where no noise is known."""
 
 _SAMPLED = 10_000
-"""Most pixels of which medians are taken."""
+"""Most pixels of which scatters and the median of a level less the dark are taken."""
 
 
 class LevelNoise(NamedTuple):
@@ -109,6 +110,14 @@ class Levels(Measured):
             level_noise=None if noise is None else tuple(noise[level] for level in exposures),
         )
 
+    def part(self) -> Self:
+        """Return the levels of a part of the good pixels, evenly over the sensor, as one row."""
+        if np.count_nonzero(self.good) <= ENOUGH:
+            return self
+        pixels = np.zeros(self.shape, bool)
+        pixels.flat[chosen(self.good)] = True
+        return self.of_pixels(pixels)
+
     def counting(self, alike: Bools) -> Self:
         """Return the levels with references of those of the good pixels that are alike."""
         good = self.good.copy()
@@ -117,12 +126,13 @@ class Levels(Measured):
 
     def limits(self) -> Floats:
         """Lowest and highest V̄ at which each pixel has a value, shape (2, rows, cols)."""
-        low, high = np.full((2, *self.good.shape), np.nan)
+        found = np.full((2, *self.good.shape), np.nan)
+        low, high = found
         for value, reference in zip(self.values, self.references, strict=True):
             known = np.isfinite(value)
             np.fmin(low, reference, out=low, where=known)
             np.fmax(high, reference, out=high, where=known)
-        return np.stack([low, high])
+        return found
 
     def distinct(self) -> int:
         """Count the levels whose means differ by more than six standard deviations of a pixel's.
@@ -208,12 +218,9 @@ def _check_variance(variance: Array) -> None:
 
 def _filters(values: Array, colours: Colours | None) -> Filters | None:
     """Colour filters as the rise from the lowest to the highest level shows them."""
-    known = np.isfinite(values).any(axis=(1, 2))
-    if not known.all():
+    if not all(np.isfinite(each).any() for each in values):
         return None if colours is None else Filters.of(colours, values[0])
-    medians = [float(np.nanmedian(each)) for each in values]
-    low, high = int(np.argmin(medians)), int(np.argmax(medians))
-    return Filters.of(colours, values[high] - values[low] if high != low else values[0])
+    return Filters.of(colours, *mean_rise(values))
 
 
 def _references(values: Array, usable: Bools) -> Floats:
@@ -247,7 +254,7 @@ def _noise_of(measured: Measured, pedestal: float) -> tuple[LevelNoise, ...] | N
 
 
 def _level_noise(model: NoiseModel, values: Array, pedestal: float) -> LevelNoise:
-    signal = max(0.0, float(np.nanmedian(values)) - pedestal)
+    signal = max(0.0, median(values) - pedestal)
     slope = model.gain / model.frames
     common = float(model.rounding(signal)) - model.rounding_apart(signal, values)
     return LevelNoise(float(model.variance(signal)) - common - slope * signal, slope, pedestal)
@@ -260,9 +267,9 @@ def _with_odd_responses(
     filters: Filters | None,
 ) -> BadPixels:
     """Add pixels that rise by less than half, or more than twice, as much as their neighbours."""
-    if len(values) < 2 or not np.isfinite(values).any(axis=(1, 2)).all():
+    if len(values) < 2 or not all(np.isfinite(each).any() for each in values):
         return bad_pixels
-    means = [float(np.nanmedian(each)) for each in values]
+    means = [median(each) for each in values]
     low, high = int(np.argmin(means)), int(np.argmax(means))
     rise = means[high] - means[low]
     variance = sum(float(noise[each].variance(means[each])) for each in (low, high)) if noise else 0
@@ -271,7 +278,8 @@ def _with_odd_responses(
         return bad_pixels
     # Of a colour of less response the noise is that of the array, which is the larger one.
     usual = rise if filters is None else rise * filters.map_of(values.shape[1:])
-    response = (values[high] - values[low]) / usual
+    response = values[high] - values[low]
+    response /= usual
     std = np.broadcast_to(np.sqrt(variance) / usual, response.shape)
     dead, hot = response_outliers(response, lambda: std)
     return dataclasses.replace(
@@ -281,23 +289,19 @@ def _with_odd_responses(
 
 def _scatter(values: Array, low: int, high: int) -> float:
     """Scatter between pixels of the rise from one level to another: of noise and of gains."""
-    sample = _spread(values[0].size)
+    sample = spread(values[0].size, _SAMPLED)
     below, above = (values[level].reshape(-1)[sample].astype(np.float64) for level in (low, high))
     rise = above - below
     known = rise[np.isfinite(rise)]
     return float(np.median(np.abs(known - np.median(known)))) if known.size else 0.0
 
 
-def _spread(count: int) -> Array:
-    """Some of so many pixels, over all rows and columns."""
-    return np.linspace(0, count - 1, min(count, _SAMPLED)).astype(np.intp)
-
-
 def _good(values: Array, bad_pixels: BadPixels, mask: Bools | None) -> Bools:
     """Good pixels with a value at every level; refused where they are few."""
-    known = np.isfinite(values)
     bad = union(bad_pixels.dead, bad_pixels.hot, bad_pixels.noisy)
-    usable = np.asarray(known.all(axis=0))
+    usable = np.ones(values.shape[1:], bool)
+    for each in values:
+        usable &= np.isfinite(each)
     if bad is not None:
         usable &= ~bad
     wanted = np.ones_like(usable)
@@ -305,7 +309,7 @@ def _good(values: Array, bad_pixels: BadPixels, mask: Bools | None) -> Bools:
         wanted &= ~mask.reshape(-1, *usable.shape).all(axis=0)
     share = float(usable.sum() / int(wanted.sum()))
     if share < FEWEST_VALID or not usable.any():
-        missing = [1 - np.mean(each[wanted]) for each in known]
+        missing = [1 - np.mean(np.isfinite(each[wanted])) for each in values]
         odd = 0.0 if bad is None else float(np.mean(bad[wanted]))
         raise InputError(
             f"'levels': {share:.1%} of the pixels are good and have a value at every level, "
@@ -322,19 +326,18 @@ def _on_bright_dark(levels: Levels) -> str | None:
     """
     if levels.dark is None:
         return None
-    sample = np.flatnonzero(levels.good)
-    sample = sample[_spread(len(sample))]
-    of_dark = 0.0 if levels.dark_variance is None else float(np.median(levels.dark_variance))
+    sample = chosen(levels.good, _SAMPLED)
+    of_dark = 0.0 if levels.dark_variance is None else median(levels.dark_variance)
     below = []
     for level, every in enumerate(levels.values):
         each = every.reshape(-1)[sample]
-        median = float(np.median(each))
+        middle = float(np.median(each))
         if levels.level_noise is None:
-            sigma = float(np.median(np.abs(each - median))) / np.sqrt(MEDIAN_SQUARE)
+            sigma = float(np.median(np.abs(each - middle))) / np.sqrt(MEDIAN_SQUARE)
         else:
-            sigma = np.sqrt(float(levels.level_noise[level].variance(median)) + of_dark)
-        if median < -SIGMAS * sigma:
-            below.append(f"{median:.6g} DN at level {level}")
+            sigma = np.sqrt(float(levels.level_noise[level].variance(middle)) + of_dark)
+        if middle < -SIGMAS * sigma:
+            below.append(f"{middle:.6g} DN at level {level}")
     if not below:
         return None
     return (
@@ -391,14 +394,17 @@ def alike_pixels(squares: Floats) -> Bools:
     -------
     ndarray of bool, shape (pixels,)
         False where at some order it is above 36 times the variance of the normal variable whose
-        square has the median of the array; of more than one pixel in twenty, for those that deviate
-        most.
+        square has the median of the array, of 2¹⁹ pixels where there are more; of more than one
+        pixel in twenty, for those that deviate most.
     """
-    limits = SIGMAS**2 / MEDIAN_SQUARE * np.median(squares, axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):  # the median of exact levels may be 0
-        excess = np.nan_to_num(squares / limits[:, None], posinf=0).max(axis=0)
-    most = int(_FEW * excess.size)
+    limits = [SIGMAS**2 / MEDIAN_SQUARE * np.median(known_part(each)) for each in squares]
+    excess, most = np.zeros(squares.shape[1]), int(_FEW * squares.shape[1])
+    for each, limit in zip(squares, limits, strict=True):
+        if limit > 0:  # the median of exact levels may be 0
+            np.fmax(excess, each / limit, out=excess)
     if not most:
         return np.ones(excess.size, bool)
+    if np.count_nonzero(excess > 1) <= most:
+        return np.asarray(excess <= 1)
     # Of more than `most`, those that deviate most are left out.
-    return np.asarray(excess <= max(1.0, float(np.partition(excess, -most - 1)[-most - 1])))
+    return np.asarray(excess <= np.partition(excess, -most - 1)[-most - 1])

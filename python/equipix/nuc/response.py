@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, DTypeLike
 
 from equipix._check import Array, Bools, Floats, as_array, naming_memory
 from equipix.correction.apply import CorrectionBase, Formula, checked_frames
@@ -14,6 +14,7 @@ from equipix.findings import Findings, usable
 from equipix.io.record import Counts, Doubles, Map, Record
 from equipix.measured.colour import Colours
 from equipix.measured.noise import median_of_noise
+from equipix.measured.part import chosen
 from equipix.nuc.curves import counted_from, exact_inverse, response_at, slope_at
 
 _LARGEST = int(np.iinfo(np.uint32).max)
@@ -125,9 +126,15 @@ class Response(CorrectionBase, Record, kind="response", version=2):
     @property
     def freedom(self) -> Array:
         """Degrees of freedom of each pixel's fit: levels used less coefficients, 0 or more."""
+        freedom = self.used.astype(np.int64)
+        freedom -= self._terms
+        return np.maximum(freedom, 0, out=freedom)
+
+    @property
+    def _terms(self) -> int:
+        """Number of coefficients that were fitted to each pixel."""
         by_gain = self.metadata.get("options", {}).get("order") == 0
-        terms = 1 if by_gain else len(self.deviation)
-        return np.maximum(self.used.astype(np.int64) - terms, 0)
+        return 1 if by_gain else len(self.deviation)
 
     @property
     def valid_range(self) -> Floats:
@@ -144,6 +151,12 @@ class Response(CorrectionBase, Record, kind="response", version=2):
         A stored dark is part of them. NaN where the curve is undetermined or does not rise.
         """
         return self.inverse.copy() if self.dark is None else counted_from(self.inverse, self.dark)
+
+    def _planes(self, dtype: DTypeLike) -> Array:
+        """The coefficients, rounded to a dtype block by block."""
+        if self.dark is None:
+            return np.asarray(self.inverse, dtype)
+        return counted_from(self.inverse, self.dark, dtype)
 
     @property
     def largest_inverse_error(self) -> float:
@@ -247,7 +260,8 @@ def pattern_variance(response: Response, level: float) -> float:
 
     With x the powers of V̄ it is xᵀ C x over the square of the slope. C, the covariance of the
     coefficients, is that of the weights of the levels, times what the variance of the highest
-    coefficient of a pixel says. The noise of a stored dark cancels. NaN behind colour filters,
+    coefficient of a pixel says; of more than 2¹⁹ pixels so many, evenly over the sensor, are asked.
+    The noise of a stored dark cancels. NaN behind colour filters,
     whose levels are not stored, and for one point by gain, or by offset with a dark.
     """
     noise, order = response.metadata.get("level_variances"), response.order
@@ -263,9 +277,10 @@ def pattern_variance(response: Response, level: float) -> float:
     covariance = np.linalg.inv(design.T @ (design / np.reshape(noise, (-1, 1))))
     at = (level / scale) ** np.arange(order + 1)
     share = float(at @ covariance @ at / covariance[-1, -1]) * scale ** (2 * order)
-    good = usable(response.flags) & (response.used == len(response.levels))
-    slope = np.broadcast_to(slope_at(response.deviation, level), response.shape)
-    return float(np.mean(share * response.variances[-1][good] / slope[good] ** 2))
+    good = chosen(usable(response.flags) & (response.used == len(response.levels)))
+    place = np.unravel_index(good, response.shape)
+    slope = slope_at(np.stack([each[place] for each in response.deviation])[:, None], level)
+    return float(np.mean(share * response.variances[-1][place] / slope**2))
 
 
 def typical(squares: Floats, freedom: Array) -> float:
@@ -278,10 +293,15 @@ def typical(squares: Floats, freedom: Array) -> float:
 
 
 def common_misfit(response: Response) -> float:
-    """Reduced χ² that usable pixels have in common, over that of noise alone."""
+    """Reduced χ² that usable pixels have in common, over that of noise alone.
+
+    Of more than 2¹⁹ pixels so many, evenly over the sensor, are asked: with one degree of freedom
+    it errs by 0.3 %.
+    """
     if response.metadata.get("options", {}).get("weights") != "variances":
         return float("nan")
-    judged = usable(response.flags) & (response.freedom > 0)
-    if not judged.any():
+    judged = chosen(usable(response.flags) & (response.used > response._terms))
+    if not judged.size:
         return float("nan")
-    return typical(response.reduced_chi2[judged], response.freedom[judged])
+    freedom = response.used.flat[judged].astype(np.int64) - response._terms
+    return typical(response.reduced_chi2.flat[judged], freedom)

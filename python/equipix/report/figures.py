@@ -125,9 +125,10 @@ def _level_values(response: Response) -> dict[str, list[str]]:
 
 def _misfit(response: Response, options: dict[str, Any]) -> float:
     """Median reduced χ² over that of noise; without variances the mean, a variance in DN²."""
-    judged = usable(response.flags) & (response.freedom > 0)
-    if options.get("weights") == "equal" and judged.any():
-        return float(np.mean(response.reduced_chi2[judged]))
+    if options.get("weights") == "equal":
+        judged = usable(response.flags) & (response.freedom > 0)
+        if judged.any():
+            return float(np.mean(response.reduced_chi2[judged]))
     return common_misfit(response)
 
 

@@ -21,7 +21,7 @@
 
 use crate::control::Control;
 use crate::error::{Error, Result};
-use crate::frames::{Real, Stack};
+use crate::frames::{Real, Shape, Stack};
 use crate::memory;
 use crate::parallel::Workers;
 
@@ -30,6 +30,9 @@ const TERMS: usize = 4;
 
 /// Fits of a pixel: with variances at the array's mean, and at the signals of the fit before.
 const ROUNDS: usize = 2;
+
+/// Rows that are fitted before their polynomials are put into planes.
+const ROWS: usize = 64;
 
 /// Least pivot of the normal equations, relative to its diagonal element: below it the levels do not
 /// distinguish the terms.
@@ -130,14 +133,10 @@ pub fn fit<T: Real>(
 ) -> Result<ResponseFit> {
     let abscissa = Abscissa::of(levels, form)?;
     let pixels = levels.means.shape().len();
-    memory::check(bytes_needed(pixels, form), || {
+    memory::check(bytes_needed(levels.means.shape(), form), || {
         format!("fitting response curves of {}", levels.means.shape())
     })?;
-    let cols = levels.means.shape().cols;
-    let rows = workers.map(levels.means.shape().rows, |row| {
-        control.check()?;
-        Ok(abscissa.fit_row(levels, row))
-    });
+    let Shape { rows, cols } = levels.means.shape();
     let planes = form.order() + 1;
     let mut found = ResponseFit {
         coefficients: vec![0.0; planes * pixels],
@@ -145,23 +144,31 @@ pub fn fit<T: Real>(
         misfit: Vec::with_capacity(pixels),
         used: Vec::with_capacity(pixels),
     };
-    for (row, polynomials) in rows.into_iter().enumerate() {
-        for (col, pixel) in polynomials?.iter().enumerate() {
-            for power in 0..planes {
-                found.coefficients[power * pixels + row * cols + col] = pixel.coefficients[power];
-                found.variances[power * pixels + row * cols + col] = pixel.variances[power];
+    for start in (0..rows).step_by(ROWS) {
+        let band = workers.map(ROWS.min(rows - start), |row| {
+            control.check()?;
+            Ok(abscissa.fit_row(levels, start + row))
+        });
+        for (row, polynomials) in band.into_iter().enumerate() {
+            for (col, pixel) in polynomials?.iter().enumerate() {
+                for power in 0..planes {
+                    let place = power * pixels + (start + row) * cols + col;
+                    found.coefficients[place] = pixel.coefficients[power];
+                    found.variances[place] = pixel.variances[power];
+                }
+                found.misfit.push(pixel.misfit);
+                found.used.push(pixel.used);
             }
-            found.misfit.push(pixel.misfit);
-            found.used.push(pixel.used);
         }
     }
     Ok(found)
 }
 
-/// Bytes of the polynomials, row by row, and of the planes that they are copied to.
-fn bytes_needed(pixels: usize, form: Form) -> u64 {
+/// Bytes of the planes, and of the polynomials of a few rows.
+fn bytes_needed(shape: Shape, form: Form) -> u64 {
     let planes = (2 * (form.order() + 1) + 1) * size_of::<f64>() + size_of::<u32>();
-    pixels as u64 * (size_of::<Polynomial>() + planes) as u64
+    let band = shape.cols.saturating_mul(ROWS.min(shape.rows) * size_of::<Polynomial>());
+    shape.len().saturating_mul(planes).saturating_add(band) as u64
 }
 
 /// The polynomial of one pixel.
@@ -232,11 +239,14 @@ impl Abscissa {
             misfit: normal.misfit(&q),
             used: normal.used,
         };
-        for power in 0..TERMS {
+        // A power of x holds lower powers of V̄ alone.
+        let terms = 0..=self.form.order();
+        for power in terms.clone() {
             let row = self.to_dn.map(|powers| powers[power]);
-            pixel.coefficients[power] = (0..TERMS).map(|i| row[i] * q[i]).sum();
-            pixel.variances[power] = (0..TERMS)
-                .map(|i| (0..TERMS).map(|j| row[i] * covariance[i][j] * row[j]).sum::<f64>())
+            pixel.coefficients[power] = terms.clone().map(|i| row[i] * q[i]).sum();
+            pixel.variances[power] = terms
+                .clone()
+                .map(|i| terms.clone().map(|j| row[i] * covariance[i][j] * row[j]).sum::<f64>())
                 .sum();
         }
         pixel
@@ -252,7 +262,7 @@ impl Abscissa {
             let reference = levels.references[level];
             let signal = reference + horner(q, x);
             let variance = levels.noise.map_or(1.0, |noise| noise[level].variance(signal));
-            normal.add(x, value - reference, 1.0 / variance);
+            normal.add(x, value - reference, 1.0 / variance, self.form.order());
         }
         normal
     }
@@ -282,12 +292,12 @@ struct Normal {
 }
 
 impl Normal {
-    fn add(&mut self, x: f64, y: f64, weight: f64) {
+    fn add(&mut self, x: f64, y: f64, weight: f64, order: usize) {
         let mut power = weight;
-        for (i, moment) in self.moments.iter_mut().enumerate() {
-            *moment += power;
-            if let Some(right) = self.right.get_mut(i) {
-                *right += power * y;
+        for i in 0..=2 * order {
+            self.moments[i] += power;
+            if i <= order {
+                self.right[i] += power * y;
             }
             power *= x;
         }

@@ -73,7 +73,7 @@ fn arrays(py: Python<'_>, found: ResponseFit, form: Form, shape: Shape) -> PyRes
     Ok((
         found.coefficients.into_pyarray(py).reshape(sizes)?.unbind(),
         found.variances.into_pyarray(py).reshape(sizes)?.unbind(),
-        image(py, found.misfit, shape)?,
+        found.misfit.into_pyarray(py).reshape([shape.rows, shape.cols])?.unbind(),
         image(py, found.used, shape)?,
     ))
 }
