@@ -376,6 +376,14 @@ def test_ctrl_c_stops_within_half_a_second(
     assert [path.name for path in tmp_path.iterdir()] == ["long.tif"]
 
 
+def test_numbers_below_zero_come_first_and_a_hyphen_is_no_sign(tmp_path: Path) -> None:
+    ordered = ["-70C.png", "-10C.png", "0C.png", "5C.png", "20C.png"]
+    ordered += ["at_-20.png", "at_-3.png", "at_4.png", "day-01-9.png", "day-01-10.png"]
+    for name in ordered:
+        (tmp_path / name).touch()
+    assert [path.name for path in find_files(tmp_path / "*.png")] == ordered
+
+
 def test_globs_are_in_natural_order(tmp_path: Path) -> None:
     for name in ("f10.png", "f9.png", "f1.png", "g.txt", ".f2.png"):
         (tmp_path / name).touch()

@@ -9,7 +9,7 @@ import equipix
 from equipix import errors, simulate
 from equipix.measured.defects import dead_pixels, hot_pixels
 from equipix.measured.means import Averaged
-from equipix.measured.noise import NoiseModel
+from equipix.measured.noise import MEDIAN_SQUARE, NoiseModel, chi2_tail, median_of_noise
 from given import exposures_of
 
 CROSS = equipix.cross_pattern(5, 7)
@@ -114,3 +114,14 @@ def test_a_pixel_without_samples_hides_no_defect():
     signals[:, 20, 20] = np.nan
     signals[0, :16, :16] = np.nan
     assert np.argwhere(dead_pixels(signals, None)).tolist() == [[7, 8], [20, 20]]
+
+
+def test_the_median_of_reduced_chi2_is_half_way_of_its_tail():
+    freedom = np.array([[3, 1], [2, 1]])
+    found = median_of_noise(freedom)
+    assert found.shape == freedom.shape
+    halves = [chi2_tail(x * f, f) for x, f in zip(found.flat, freedom.flat, strict=True)]
+    # Sums of at most three terms.
+    np.testing.assert_allclose(halves, 0.5, rtol=8 * np.finfo(float).eps)
+    assert found[0, 1] == pytest.approx(MEDIAN_SQUARE, abs=5e-5)  # which has four digits
+    assert np.isnan(median_of_noise(np.array(0)))

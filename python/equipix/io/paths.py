@@ -31,7 +31,8 @@ def find_files(
     Returns
     -------
     list of Path
-        At least one file; a list keeps its order, and ``f2`` precedes ``f10`` in a glob.
+        At least one file; a list keeps its order. In a glob ``f2`` precedes ``f10``, and ``-20C``
+        precedes ``-10C``: a minus that follows no letter, digit or bracket is a sign.
 
     Raises
     ------
@@ -67,8 +68,8 @@ def _matches(name: str | PathLike[str], folder: Path) -> list[Path]:
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
-    parts = re.split(r"([0-9]+)", str(path))
-    return [(int(part), part) if part[:1].isdecimal() else (-1, part) for part in parts]
+    parts = re.split(r"((?<![0-9A-Za-z)\]])-[0-9]+|[0-9]+)", str(path))
+    return [(int(part) if k % 2 else 0, part) for k, part in enumerate(parts)]
 
 
 def as_path(name: str, value: object) -> Path:
