@@ -135,7 +135,8 @@ class TestJson:
         status, out, err = run("average", frames, "-o", tmp_path / "a.npz", *given)
         assert (status, out) == (130, "")
         told = {"error": "stopped by Ctrl-C", "code": "interrupted"}
-        assert err == (json.dumps(told) + "\n" if given else "")
+        line = json.dumps(told) if given else "equipix: error: stopped by Ctrl-C"
+        assert err == f"{line}\n"
 
     def test_without_it_an_error_is_a_line(self, run):
         assert run("inspect", "none.tif")[2] == "equipix: error: none.tif: does not exist\n"

@@ -14,7 +14,8 @@ def main(arguments: list[str] | None = None) -> None:
 
         run(given)
     except KeyboardInterrupt:
+        told = "equipix: error: stopped by Ctrl-C"
         if "--json" in given:
             told = '{"error": "stopped by Ctrl-C", "code": "interrupted"}'
-            print(told, file=sys.stderr)  # noqa: T201
+        print(told, file=sys.stderr)  # noqa: T201
         raise SystemExit(130) from None
