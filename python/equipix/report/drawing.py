@@ -143,7 +143,14 @@ def draw_flags(axes: Axes, flags: Array) -> None:
         aspect="equal",
     )
     if found:
-        axes.legend(fontsize="small", loc="upper right", framealpha=0.9)
+        # Below the map: on it, it would hide pixels.
+        axes.legend(
+            fontsize="small",
+            ncols=2,
+            loc="upper center",
+            bbox_to_anchor=(0.5, -0.16),
+            borderaxespad=0.0,
+        )
 
 
 def draw_histogram(axes: Axes, shown: Map) -> None:
