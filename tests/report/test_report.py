@@ -480,6 +480,7 @@ class TestCommand:
             (("SAVED", "-o", "OUT.pdf"), "ends in none of .html"),
             (("SAVED", "-o", "OUT.html", "--check"), "--check needs --limits"),
             (("missing.tif", "-o", "OUT.html"), "missing.tif: does not exist"),
+            (("SAVED", "SAVED", "-o", "OUT.html"), "is named twice: name each result once"),
         ],
     )
     def test_refuses(self, saved, tmp_path, run, arguments, words):
