@@ -49,7 +49,7 @@ FIELDS = {
     "flux objective reduced_chi2 components component_labels sweeps converged error_estimate "
     "history dark dark_is_fitted rejected shift_sign drift tilt sensitivity_std tilt_std shift_std "
     "colour_response coefficients is_partial",
-    "CameraFigures": "transfer spatial photons exposure_s on off bright dark findings",
+    "CameraFigures": "transfer spatial photons exposure_s on off bright dark",
     "Camera": "offset response good full_scale",
     "Comparison": "sensitivities agreement pairs rms block_rms largest open_tilt predicted_rms "
     "predicted_block_rms",

@@ -72,8 +72,8 @@ class Comparison(Brief, Shown):
         their ratio is no difference, and is left out of all figures.
     predicted_rms, predicted_block_rms : ndarray, shape (pairs,), float64, or None
         What the uncertainties of two independent calibrations predict for `rms` and `block_rms`,
-        with the estimated errors of their solvers; NaN where it is not known, None where it is of
-        no pair.
+        with the estimated errors of their solvers; NaN where it is not known. Both None where
+        `predicted_rms` is known of no pair.
     checks : tuple of tuple of Check
         Of each pair what is judged: ``what``, ``found``, ``predicted``, and between which ratios
         ``low`` and ``high`` of both noise leaves it. Empty where nothing is predicted.

@@ -708,6 +708,7 @@ class TestPlan:
         assert status == 0
         assert "tilt from lamp drift" in out
         assert "in the order advised: " in out
+        assert out.splitlines()[-1].split() == ["picture", str(picture)]
         assert err.startswith("equipix: warning: lamp drift will tilt")
         assert picture.stat().st_size > 0
 

@@ -301,6 +301,22 @@ class TestBolometer:
         assert words in err
         assert not out.exists()
 
+    @pytest.mark.parametrize(
+        ("bodies", "celsius", "words"),
+        [
+            ((), "0 20", "--substrate-c has 2 entries, expected 3"),
+            (("--cold", "c.npy", "--hot", "h.npy"), "0 20 40", "--cold names 1 files, expected 3"),
+        ],
+    )
+    def test_counts_are_checked_before_files_are_read(
+        self, run, tmp_path, monkeypatch, bodies, celsius, words
+    ):
+        monkeypatch.chdir(tmp_path)
+        for name in ("s0.npy", "s1.npy", "s2.npy", "c.npy", "h.npy"):
+            (tmp_path / name).write_bytes(b"no frames")
+        given = ("--substrate-c", celsius, "--bias-v", "2", "-o", "dynamic.npz", *bodies)
+        assert words in run("bolometer", "s0.npy", "s1.npy", "s2.npy", *given)[2]
+
     def test_a_file_of_two_states_is_refused(self, run, folder, tmp_path):
         one, out = folder / "shutter0.npy", tmp_path / "dynamic.npz"
         given = ("--substrate-c", "0 20", "--bias-v", "2", "-o", out)

@@ -201,6 +201,14 @@ class TestLevels:
             "#   science/0.tif: no frames of the sensor by its name",
         ]
 
+    def test_names_may_hold_control_characters(self, run, tmp_path):
+        for name in ("a\x7f1.tif", "b\n1.tif"):
+            write(tmp_path / name, 100)
+            (tmp_path / f"no{name}").write_bytes(b"no image")
+        assert run("init", "levels", tmp_path)[0] == 0
+        content = tomllib.loads((tmp_path / "levels.toml").read_text())
+        assert [each["frames"] for each in content["level"]] == ["a\x7f1.tif", "b\n1.tif"]
+
 
 class TestCamera:
     @pytest.mark.parametrize("darks", [1, 3])

@@ -188,6 +188,15 @@ class TestTruth:
         # Errors of 95 % leave out at most 5 % of 800 slopes: with five standard errors.
         assert np.mean(known) <= (0 if one else 0.05 + 5 * np.sqrt(0.05 * 0.95 / 800))
 
+    def test_a_dark_that_serves_several_levels_counts_once(self):
+        """Repeated it was taken for more data: noise of three darks gave a dark current."""
+        times, off = np.array([1.0, 2.0, 3.0]), np.array([[100, 4.0], [101, 5.0], [101, 4.5]])
+        once = dark_lines(times, off)
+        repeated = dark_lines(np.repeat(times, 10), np.repeat(off, 10, axis=0))
+        assert np.isnan(once.slopes).all()
+        for one, other in zip(once, repeated, strict=True):
+            np.testing.assert_array_equal(one, other)
+
     @pytest.mark.parametrize(
         ("at_zero", "error", "noise"),
         [

@@ -904,6 +904,16 @@ def test_where_no_width_suffices_the_worst_place_is_that_of_16_bits(made):
     assert found.worst["gain"] == (costs.index(max(costs)), "") == (1, "")
 
 
+def test_frames_that_this_correction_has_corrected_are_named_so(made, tmp_path, run):
+    array, response = made
+    response.save(tmp_path / "response.npz")
+    write_frames(tmp_path / "raw.tif", np.stack(list(array.frames(9e6, 4, rng=3))), nbytes=1)
+    again = tmp_path / "again.tif"
+    assert run("correct", tmp_path / "response.npz", tmp_path / "raw.tif", "-o", again)[0] == 0
+    command = ["hardware", tmp_path / "response.npz", "-o", tmp_path / "table.hex"]
+    assert "again.tif: corrected already, by this correction" in run(*command, "--frames", again)[2]
+
+
 def test_findings_of_a_table_and_of_its_frames_are_shown(made, tmp_path, run):
     array, response = made
     limit = Finding("light", "what, value, limit, remedy", "misfit")

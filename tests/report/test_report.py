@@ -480,6 +480,7 @@ class TestCommand:
             (("SAVED", "-o", "OUT.pdf"), "ends in none of .html"),
             (("SAVED", "-o", "OUT.html", "--check"), "--check needs --limits"),
             (("missing.tif", "-o", "OUT.html"), "missing.tif: does not exist"),
+            (("SAVED", "SAVED", "-o", "OUT.html"), "is named twice: name each result once"),
         ],
     )
     def test_refuses(self, saved, tmp_path, run, arguments, words):
@@ -719,3 +720,14 @@ def test_a_histogram_of_equal_values_has_the_one_that_is_far_out(far):
     counts, edges, _ = bars.get_data()
     assert sorted(counts[counts > 0]) == [1, values.size - 1]
     assert edges[0] <= min(1, far) < max(1, far) <= edges[-1]
+
+
+@pytest.mark.parametrize("draw", [draw_histogram, draw_spectrum])
+def test_a_value_whose_square_overflows_is_drawn(draw):
+    """NumPy warned of its square, and the spectrum was infinite."""
+    values = np.random.default_rng(1).standard_normal((40, 40))
+    values[1, 1] = 1e300
+    axes = new_figure(4, 3).subplots()
+    draw(axes, Map("Dark", "DN", values))
+    for line in axes.lines:
+        assert np.isfinite(line.get_ydata()).all()

@@ -8,6 +8,7 @@ import numpy as np
 import typer
 
 from equipix.bolometer import fit as fit_states
+from equipix.bolometer.states import States
 from equipix.calibration.result import Calibration
 from equipix.cli import terminal
 from equipix.cli.frames import averaged
@@ -128,6 +129,13 @@ def bolometer(
     refuse_inputs(files, [], "is named twice: name each file once")
     refuse_inputs([output], [*files, *terminal.given(mask)])
     options["order"] = int(order) if order.isdecimal() else order
+    # Checked before the files are read, which takes long.
+    States.of(celsius, volts, len(series[0]), options["bias_order"], options["regressor"])
+    for name, each in zip(("--cold", "--hot"), series[1:], strict=False):
+        if len(each) != len(celsius):
+            raise InputError(
+                f"{name} names {len(each)} files, expected {len(celsius)}: one for each state"
+            )
     with terminal.working(mask) as (progress, excluded):
         first, *bodies = (
             [average(file, workers=workers, progress=progress) for file in each] for each in series

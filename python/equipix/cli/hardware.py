@@ -86,7 +86,7 @@ def hardware(
     correction = load_correction(result)
     check_sensor(correction, sensor)
     table = Table.of(correction, **options)
-    cost, said = _cost(correction, frames, options) if frames else ({}, ())
+    cost, said = _cost(result, correction, frames, options) if frames else ({}, ())
     table.save(output, force=force)
     figures = {"output": str(output), **summary(table), **cost}
     if gains_alone:
@@ -123,11 +123,13 @@ def _preset(output: Path, given: dict[str, Any]) -> dict[str, Any]:
 
 
 def _cost(
-    correction: Correction, frames: list[str], options: dict[str, Any]
+    file: Path, correction: Correction, frames: list[str], options: dict[str, Any]
 ) -> tuple[dict[str, Any], Findings]:
     """Measure C of frames of each level by correction and table, and the widths that suffice."""
     with naming_memory("measuring quality"):
-        tried, said = zip(*(_tried(correction, each, options) for each in frames), strict=True)
+        tried, said = zip(
+            *(_tried(file, correction, each, options) for each in frames), strict=True
+        )
     widths = widths_of([level.by_width for level in tried])
     costs = {
         (number, plane): cost
@@ -157,9 +159,11 @@ def _cost(
     return figures, tuple(found)
 
 
-def _tried(correction: Correction, pattern: str, options: dict[str, Any]) -> tuple[Trial, Findings]:
+def _tried(
+    file: Path, correction: Correction, pattern: str, options: dict[str, Any]
+) -> tuple[Trial, Findings]:
     """Measure the cost at one level, whose frames are read and left again."""
-    raw, said = terminal.raw_frames([pattern])
+    raw, said = terminal.raw_frames([pattern], file)
     if len(raw) < 2:
         raise InputError(
             f"{pattern}: holds one frame, expected two or more: each 'frames' names all of a "

@@ -90,6 +90,8 @@ def plan(
                 "with {exposures} positions: {rms:.2e} of all causes, {expected_passes:.0f} passes"
             )
             print(words.format(**gain))  # noqa: T201
+        if output is not None:
+            terminal.show_result({"picture": str(output)}, as_json=False)
 
 
 def _refuse_both(

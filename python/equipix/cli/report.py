@@ -9,6 +9,7 @@ from equipix.cli import terminal
 from equipix.errors import InputError
 from equipix.hardware.table import Table
 from equipix.io.formats import SUFFIXES
+from equipix.io.paths import refuse_inputs
 from equipix.io.viewed import Use
 from equipix.report.limits import in_json, read_limits, refuse_beyond
 from equipix.report.page import page, part_of, write_page
@@ -31,6 +32,7 @@ def report(
 ) -> None:
     """Write results as one page, judged by limits."""
     terminal.check_output(output, results, force=force, suffixes=(".html",))
+    refuse_inputs(results, [], "is named twice: name each result once")
     wanted = read_limits(limits, check=check)
     parts = [part_of(str(file), load(file), wanted, share=len(results)) for file in results]
     title = f"Report of {results[0].name}" if len(results) == 1 else f"{len(results)} results"

@@ -20,6 +20,9 @@ _TITLE = (
     "comment, or a key that may be left out: remove its # to set it."
 )
 
+_CONTROL = r"[\x00-\x1f\x7f]"
+"""Characters of names that end a comment of TOML, or that it refuses."""
+
 _Entry = str | list[str]
 """Names of files as a manifest has them."""
 
@@ -105,7 +108,8 @@ def _findings(found: FoundImages, folder: Path, unused: dict[str, str]) -> Itera
 
 def _comments(unused: dict[str, str]) -> str:
     """List images that are not used as comments."""
-    lines = [f"#   {name}: {why}" for name, why in unused.items()]
+    plain = ((re.sub(_CONTROL, "?", name), why) for name, why in unused.items())
+    lines = [f"#   {name}: {why}" for name, why in plain]
     return "\n".join(["", "# Images that are not used:", *lines, ""]) if lines else ""
 
 

@@ -76,5 +76,8 @@ def _comment(text: str | None) -> list[str]:
 
 
 def _toml(value: Any) -> str:
-    """Write a text, a number, a truth value or a list of these; TOML has them as JSON does."""
-    return json.dumps(value, ensure_ascii=False)
+    """Write a text, a number, a truth value or a list of these; TOML has them as JSON does.
+
+    But for the character 127, which is a control character in TOML alone.
+    """
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", r"\u007f")

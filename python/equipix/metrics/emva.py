@@ -398,10 +398,11 @@ def emva_transfer(
 
     There a variance without light counts as 0.24 DN² at least. The dark current is the slope of
     the means of the darks over the exposure time, divided by K, and that of their variances,
-    divided by K². A slope counts if its error, of 95 % by Student's t, is below its size: otherwise
-    it may as well be 0. The variance at the time 0 counts if its error is at most half of it, or
-    0.12 DN²; otherwise σ_d is that of the darks as they are. A negative one is 0 up to twice its
-    error. Beyond that it contradicts the exposure times, and `dark_noise_dn` is negative.
+    divided by K². A dark of several levels counts once. A slope counts if its error, of 95 % by
+    Student's t, is below its size: otherwise it may as well be 0. The variance at the time 0 counts
+    if its error is at most half of it, or 0.12 DN²; otherwise σ_d is that of the darks as they are.
+    A negative one is 0 up to twice its error. Beyond that it contradicts the exposure times, and
+    `dark_noise_dn` is negative.
 
     References
     ----------
@@ -516,7 +517,12 @@ class DarkLines(NamedTuple):
 
 
 def dark_lines(times: Floats, off: Floats) -> DarkLines:
-    """Fit lines to means and variances (levels, 2) of darks at three times or more."""
+    """Fit lines to means and variances (levels, 2) of darks at three times or more.
+
+    A dark that serves several levels counts once: repeated, it would be taken for more data.
+    """
+    _, first = np.unique(np.column_stack([times, off]), axis=0, return_index=True)
+    times, off = (each[np.sort(first)] for each in (times, off))
     middle, freedom = times.mean(), len(times) - 2
     spread = np.sum((times - middle) ** 2)
     rise = off - off[0]  # exactly 0, and no slope by rounding, where one dark serves all levels

@@ -178,8 +178,11 @@ def draw_histogram(axes: Axes, shown: Map) -> None:
     axes.stairs(counts, edges, fill=True, alpha=0.6)
     if spread > 0:
         at = np.linspace(low, high, _MOST_BINS)
-        normal = np.exp(-0.5 * ((at - middle) / spread) ** 2) / (spread * np.sqrt(2 * np.pi))
-        axes.plot(at, normal * count * (edges[1] - edges[0]), color="black", linewidth=0.8)
+        away = np.clip((at - middle) / spread, -40, 40)  # further out the normal is 0
+        normal = np.exp(-0.5 * away**2) / (spread * np.sqrt(2 * np.pi))
+        # A bin that is far wider than the spread holds no more than all pixels.
+        expected = count * np.minimum(normal * (edges[1] - edges[0]), 1)
+        axes.plot(at, expected, color="black", linewidth=0.8)
     axes.set(
         title=f"Histogram of {shown.name[0].lower()}{shown.name[1:]}",
         xlabel=f"{shown.unit or 'relative'}; line: normal, by the quartiles",
@@ -240,9 +243,10 @@ def draw_spectrum(axes: Axes, shown: Map) -> None:
     for axis, name in ((1, "along rows"), (0, "along columns")):
         values = _some(shown.values, 1 - axis).astype(np.float64)
         values = np.nan_to_num(values - np.nanmean(values))
-        power = np.abs(np.fft.rfft(values, axis=axis)) ** 2
+        largest = np.abs(values).max() or 1.0  # the squares of values from 1e154 on overflow
+        power = np.abs(np.fft.rfft(values / largest, axis=axis)) ** 2
         size = values.shape[axis]
-        line = np.sqrt(power.mean(axis=1 - axis) / size)
+        line = largest * np.sqrt(power.mean(axis=1 - axis) / size)
         axes.plot(np.fft.rfftfreq(size)[1:], line[1:], linewidth=0.8, label=name)
         drawn.append(line[1:])
     axes.set(
