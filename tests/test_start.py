@@ -118,7 +118,8 @@ def test_ctrl_c_while_the_command_starts_leaves_no_traceback(module):
     """At the first import inside `main`, and at later ones."""
     command = [sys.executable, "-c", INTERRUPTED.format(module)]
     done = subprocess.run(command, capture_output=True, timeout=60)
-    assert (done.returncode, done.stdout, done.stderr) == (130, b"", b"")
+    line = b"equipix: error: stopped by Ctrl-C\n"
+    assert (done.returncode, done.stdout, done.stderr) == (130, b"", line)
 
 
 def test_the_help_loads_no_command():
