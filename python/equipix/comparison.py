@@ -145,7 +145,8 @@ def compare(
 
     - The rms over pixels, without the tilt. Its square over the predicted one follows Fisher's
       distribution. Errors of waves of M have variances 1/λ(q) (`equipix.plan.error_budget`), so
-      the found one has (Σ 1/λ)²/Σ 1/λ² degrees of freedom. Error bars with a relative standard
+      the found one has (Σ 1/λ)²/Σ 1/λ² degrees of freedom, with the waves of the rectangle around
+      the pixels that both know, times their share of it. Error bars with a relative standard
       error e (``metadata["uncertainty"]``) have 1/(2e²). Both calibrations are taken to have waves
       and draws in common, which widens the limits.
     - The tilt along rows and along columns, over `tilt_std` of both, by the normal distribution.
@@ -260,12 +261,13 @@ def _checks(
     count = [slope_pixels(each.sensitivity, each.flags) for each in pair]
     slopes = np.abs(tilt(maps[0] / maps[1], np.isfinite(pixels) & count[0] & count[1]))
     judged = np.flatnonzero((np.isfinite(tilts) & (tilts > 0)).all(axis=0) & np.isfinite(slopes))
-    blocks = bool(np.isfinite(variances[:, 1]).all()) and not drifts
+    means = block_means(difference)
+    blocks = bool(np.isfinite(variances[:, 1]).all() and np.isfinite(means).any()) and not drifts
     tail = _FALSE / (1 + len(judged) + blocks)
     evenness, exactness, predicted = 1.0, _EXACT, variances[:, 0]
     if not is_given:
         predicted, exactness, evenness = _of_bars(pair, np.isfinite(pixels))
-    found = evenness * _freedom(pair, predicted, without_tilt=not is_given)
+    found = evenness * _freedom(pair, predicted, np.isfinite(pixels), without_tilt=not is_given)
     low, high = (
         fisher_quantile(p, found, 0.5 / exactness**2) ** 0.5 for p in (tail / 2, 1 - tail / 2)
     )
@@ -276,12 +278,11 @@ def _checks(
         name = f"tilt along {('rows', 'columns')[axis]}"
         limits.append((name, float(slopes[axis]), float(tilts[:, axis].sum()), 0.0, high))
     if blocks:
-        means = rms(block_means(difference))
-        found = _freedom(pair, variances[:, 1], without_tilt=False, side=BLOCK)
+        found = _freedom(pair, variances[:, 1], np.isfinite(means), without_tilt=False, side=BLOCK)
         high = (
             fisher_quantile(1 - tail, found, 0.5 / _EXACT**2 if is_given else _MOST_BLOCKS) ** 0.5
         )
-        limits.append(("16×16 means, rms", means, float(variances[:, 1].sum()), 0.0, high))
+        limits.append(("16×16 means, rms", rms(means), float(variances[:, 1].sum()), 0.0, high))
     solver = sum(each.error_estimate**2 for each in pair)
     return tuple(
         # The estimate is no bound: solvers may as well have left nothing.
@@ -318,20 +319,35 @@ def _of_bars(pair: Sequence[Calibration], known: Bools) -> tuple[Floats, float, 
 
 
 def _freedom(
-    pair: Sequence[Calibration], variances: Floats, *, without_tilt: bool, side: int = 1
+    pair: Sequence[Calibration],
+    variances: Floats,
+    known: Bools,
+    *,
+    without_tilt: bool,
+    side: int = 1,
 ) -> float:
-    """Degrees of freedom of the mean square of two errors, of pixels or of means over blocks."""
+    """Degrees of freedom of the mean square of two errors, of pixels or of means over blocks.
+
+    `known` are the pixels or the blocks that the mean is over.
+    """
     # Tr (C₁ + C₂)² is largest where both have their waves in common.
-    roots = [v / _waves(c, without_tilt, side) ** 0.5 for c, v in zip(pair, variances, strict=True)]
+    roots = [
+        v / _waves(c, known, without_tilt, side) ** 0.5
+        for c, v in zip(pair, variances, strict=True)
+    ]
     return float(variances.sum() / sum(roots)) ** 2
 
 
-def _waves(calibration: Calibration, without_tilt: bool, side: int) -> float:
-    """Find (Σ 1/λ)²/Σ 1/λ² over waves of whole numbers of half periods along rows and columns."""
+def _waves(calibration: Calibration, known: Bools, without_tilt: bool, side: int) -> float:
+    """Find (Σ 1/λ)²/Σ 1/λ² over waves of whole numbers of half periods along rows and columns.
+
+    They are those of the rectangle around what is known, which has its share of them.
+    """
+    sizes = np.ptp(np.nonzero(known), axis=1) + 1
     count, sums = len(calibration.shifts), np.zeros(2)
     down, right = (
-        np.exp(1j * np.pi * np.outer(np.arange(-(-size // side)) / size, along))
-        for size, along in zip(calibration.shape, calibration.shifts.T, strict=True)
+        np.exp(1j * np.pi * np.outer(np.arange(size) / (size * side), along))
+        for size, along in zip(sizes, calibration.shifts.T, strict=True)
     )
     for number, row in enumerate(down):
         # cos · cos is two waves, of both signs along the columns.
@@ -339,7 +355,9 @@ def _waves(calibration: Calibration, without_tilt: bool, side: int) -> float:
         # The mean is no wave; the first ones are the tilt.
         errors = 1 / np.maximum(count - shared, _LEAST)[max(0, 1 + without_tilt - number) :]
         sums += errors.sum(), errors @ errors
-    return float(sums[0] ** 2 / sums[1])
+    # Of one line or block no wave may be left.
+    waves = sums[0] ** 2 / sums[1] if sums[1] else 0.0
+    return max(float(waves * known.sum() / sizes.prod()), 1.0)
 
 
 def _leaves_tilt(calibration: Calibration) -> bool:

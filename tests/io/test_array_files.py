@@ -128,6 +128,10 @@ def test_a_part_at_a_time(tmp_path, monkeypatch, write):
         (lambda folder: npy(folder, FRAMES[:0]), r"of shape \(0, 8, 9\), expected .* 1 or more"),
         (lambda folder: hdf5(folder, FRAMES[:, :0]), r"of shape \(5, 0, 9\), expected"),
         (lambda folder: default(folder, "entry", str), "holds /entry/a, /entry/b: name one"),
+        (
+            lambda folder: extensions(folder, [FRAMES[0], FRAMES[0, :5]]),
+            r"several shapes \(\(8, 9\), \(5, 9\)\)",
+        ),
         (lambda folder: folder / "none.fits", "does not exist"),
         (lambda folder: f"{folder}/none.h5:/entry", "does not exist"),
     ],

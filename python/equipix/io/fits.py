@@ -237,7 +237,7 @@ def _images(path: Path, units: Any) -> list[Any]:
     images = _every_image(units)
     shapes = list(dict.fromkeys(unit.shape[-2:] for unit in images))
     if not shapes:
-        held = ", ".join(f"{unit.name} {unit.shape}" for unit in units if unit.is_image)
+        held = _in_words(unit for unit in units if unit.is_image)
         raise FileError(f"{path}: holds {held or 'tables'}, expected an image")
     beside = [unit.name for unit in images if unit.name in _BESIDE]
     if beside:
@@ -246,9 +246,15 @@ def _images(path: Path, units: Any) -> list[Any]:
             "them to a file of their own"
         )
     if len(shapes) > 1:
-        held = ", ".join(f"{unit.name} {unit.shape}" for unit in images)
-        raise FileError(f"{path}: holds images of several shapes ({held}), expected one")
+        raise FileError(
+            f"{path}: holds images of several shapes ({_in_words(images)}), expected one"
+        )
     return images
+
+
+def _in_words(images: Iterable[Any]) -> str:
+    """Name images, where they have names, with their shapes."""
+    return ", ".join(f"{unit.name} {unit.shape}".strip() for unit in images)
 
 
 def _every_image(units: Any) -> list[Any]:
