@@ -492,6 +492,24 @@ def test_few_pixels_have_few_degrees_of_freedom():
     assert half == pytest.approx(own / 2, rel=1e-12)
 
 
+@pytest.mark.parametrize("predicted", [None, [(1e-3, 1e-4)] * 2])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 2), (1, 64), (2, 2), (16, 16)])
+def test_very_few_pixels_do_not_contradict(alike, shape, predicted):
+    known = np.zeros(SMALL, bool)
+    known[: shape[0], : shape[1]] = True
+    few = [
+        dataclasses.replace(
+            each,
+            sensitivity=np.where(known, each.sensitivity, np.nan),
+            drift=None,
+            tilt_std=None,
+            weighted=None,
+        )
+        for each in alike
+    ]
+    assert "differ by more" not in equipix.compare(few, predicted=predicted).verdicts[0]
+
+
 def test_pixels_that_one_lacks_tilt_the_others_more(alike):
     """Tilts of a whole sensor and a part, or of two parts, were 1.2 to 1.5 times as predicted."""
     first, second = (dataclasses.replace(each, drift=None, weighted=None) for each in alike)

@@ -275,7 +275,8 @@ def _checks(
         predicted, exactness, evenness = _of_bars(pair, np.isfinite(pixels))
     found = evenness * _freedom(pair, predicted, np.isfinite(pixels), without_tilt=not is_given)
     low, high = (
-        fisher_quantile(p, found, 0.5 / exactness**2) ** 0.5 for p in (tail / 2, 1 - tail / 2)
+        max(fisher_quantile(p, found, 0.5 / exactness**2), 0.0) ** 0.5  # 0 of very few pixels
+        for p in (tail / 2, 1 - tail / 2)
     )
     what = "pixels, rms" if is_given else "pixels without tilt, rms"
     limits = [(what, rms(pixels), float(predicted.sum()), low, high)]
