@@ -492,6 +492,39 @@ def test_few_pixels_have_few_degrees_of_freedom():
     assert half == pytest.approx(own / 2, rel=1e-12)
 
 
+@pytest.mark.parametrize("predicted", [None, [(1e-3, 1e-4)] * 2])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 2), (1, 64), (2, 2), (16, 16)])
+def test_very_few_pixels_do_not_contradict(alike, shape, predicted):
+    known = np.zeros(SMALL, bool)
+    known[: shape[0], : shape[1]] = True
+    few = [
+        dataclasses.replace(
+            each,
+            sensitivity=np.where(known, each.sensitivity, np.nan),
+            drift=None,
+            tilt_std=None,
+            weighted=None,
+        )
+        for each in alike
+    ]
+    assert "differ by more" not in equipix.compare(few, predicted=predicted).verdicts[0]
+
+
+def test_pixels_that_one_lacks_tilt_the_others_more(alike):
+    """Tilts of a whole sensor and a part, or of two parts, were 1.2 to 1.5 times as predicted."""
+    first, second = (dataclasses.replace(each, drift=None, weighted=None) for each in alike)
+    known = np.where(np.arange(SMALL[1]) < 20, second.sensitivity, np.nan)
+    part = dataclasses.replace(second, sensitivity=known)
+    assert not first.flags.any()
+    # Squared distances of the columns 0 to 63 and 0 to 19 from their middle; 64 and 20 in a row.
+    levers = np.array([64 / 20, 64 * np.var(np.arange(64)) / (20 * np.var(np.arange(20)))])
+    wanted = np.sqrt(first.tilt_std**2 * levers + part.tilt_std**2)
+    solver = first.error_estimate**2 + part.error_estimate**2
+    for pair in ([first, part], [part, first]):
+        found = [check.predicted for check in equipix.compare(pair).checks[0][1:3]]
+        np.testing.assert_allclose(found, np.sqrt(wanted**2 + solver), rtol=1e-12)
+
+
 @pytest.mark.parametrize("number", [0, 1])
 def test_a_pixel_far_out_in_one_of_the_two_is_no_tilt(alike, number):
     """M at a corner three times as large counts for no slope of ln M."""

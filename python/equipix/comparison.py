@@ -150,6 +150,8 @@ def compare(
       error e (``metadata["uncertainty"]``) have 1/(2e²). Both calibrations are taken to have waves
       and draws in common, which widens the limits.
     - The tilt along rows and along columns, over `tilt_std` of both, by the normal distribution.
+      Where a calibration knows pixels that the other one lacks, `tilt_std` rises as that of noise
+      of single pixels would, which is at most too much.
       Where the drift of a lamp is part of `tilt_std`, by Student's t with its degrees of freedom.
     - The rms of block means, upwards, where it is predicted and no drift of a lamp is part of it.
       That of 16 blocks has 16 degrees of freedom; that of `predicted` counts as exact.
@@ -259,7 +261,11 @@ def _checks(
     tilts = np.square([np.zeros(2) if c.tilt_std is None else c.tilt_std for c in pair])
     pixels = difference if is_given else _difference(maps[0], maps[1], True)
     count = [slope_pixels(each.sensitivity, each.flags) for each in pair]
-    slopes = np.abs(tilt(maps[0] / maps[1], np.isfinite(pixels) & count[0] & count[1]))
+    both = np.isfinite(pixels) & count[0] & count[1]
+    slopes = np.abs(tilt(maps[0] / maps[1], both))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # As noise of single pixels tilts fewer of them: that of slow waves rises by less.
+        tilts *= np.maximum([_levers(each) / _levers(both) for each in count], 1)
     judged = np.flatnonzero((np.isfinite(tilts) & (tilts > 0)).all(axis=0) & np.isfinite(slopes))
     means = block_means(difference)
     blocks = bool(np.isfinite(variances[:, 1]).all() and np.isfinite(means).any()) and not drifts
@@ -269,7 +275,8 @@ def _checks(
         predicted, exactness, evenness = _of_bars(pair, np.isfinite(pixels))
     found = evenness * _freedom(pair, predicted, np.isfinite(pixels), without_tilt=not is_given)
     low, high = (
-        fisher_quantile(p, found, 0.5 / exactness**2) ** 0.5 for p in (tail / 2, 1 - tail / 2)
+        max(fisher_quantile(p, found, 0.5 / exactness**2), 0.0) ** 0.5  # 0 of very few pixels
+        for p in (tail / 2, 1 - tail / 2)
     )
     what = "pixels, rms" if is_given else "pixels without tilt, rms"
     limits = [(what, rms(pixels), float(predicted.sum()), low, high)]
@@ -316,6 +323,16 @@ def _of_bars(pair: Sequence[Calibration], known: Bools) -> tuple[Floats, float, 
     shares = np.array(variances)
     common = float(shares @ exactness / shares.sum())
     return shares, max(common, _EXACT), float(maps.mean() ** 2 / np.mean(maps**2))
+
+
+def _levers(known: Bools) -> Floats:
+    """Sum over pixels of their squared distances from the middle, along rows and columns."""
+    sums = []
+    for counts in (known.sum(axis=1), known.sum(axis=0)):
+        places = np.arange(len(counts))
+        middle = counts @ places / max(counts.sum(), 1)
+        sums.append(counts @ np.square(places - middle))
+    return np.array(sums)
 
 
 def _freedom(
