@@ -116,6 +116,20 @@ def test_a_pixel_without_samples_hides_no_defect():
     assert np.argwhere(dead_pixels(signals, None)).tolist() == [[7, 8], [20, 20]]
 
 
+def test_a_pixel_without_a_dark_counts_in_no_noise_model(raw):
+    """It has the variance of its frames, but no signal: the model is that without the pixel."""
+    dark = np.random.default_rng(2).normal(0, 2, (8, *raw.shape[2:]))
+    dark[3, 5, 6] = dark[:, 20, 20] = np.nan
+    dark = equipix.average(dark)
+    mask = np.zeros(raw.shape[2:], bool)
+    mask[20, 20] = True
+    whole, less = (
+        Averaged.of([equipix.average(each, dark=dark, mask=given) for each in raw]).noise
+        for given in (None, mask)
+    )
+    assert whole == less
+
+
 def test_the_median_of_reduced_chi2_is_half_way_of_its_tail():
     freedom = np.array([[3, 1], [2, 1]])
     found = median_of_noise(freedom)

@@ -425,7 +425,11 @@ def _points(
     light: Light,
     period: tuple[int, int] = (1, 1),
 ) -> Array:
-    """Points of the photon-transfer curve of the pixels that are `free` of saturation."""
+    """Points of the photon-transfer curve of the pixels that are `free` of saturation.
+
+    A pixel without a dark has a variance, but no signal.
+    """
+    known = free & np.isfinite(frames.mean)
     common = None if light == Light() else light.variance(frames.mean)
     count = int(frames.count.max())
-    return photon_transfer(signal, frames.variance, free, count, frames.step, common, period)
+    return photon_transfer(signal, frames.variance, known, count, frames.step, common, period)
