@@ -89,6 +89,20 @@ def test_images_are_corrected_but_in_pixels_that_are_not_to_be_used():
         found.apply(images[:, :, 1:])
 
 
+def test_a_pixel_without_a_dark_takes_the_median():
+    weighted = fitted()
+    dark = np.linspace(5, 9, SHAPE[0] * SHAPE[1]).reshape(SHAPE)
+    dark[3, 4] = np.nan
+    flags = np.zeros(SHAPE, np.uint32)
+    flags[3, 4] = Flag.DO_NOT_USE
+    images = np.full((2, *SHAPE), 150.0)
+    found = Equalisation.of(weighted, flags, darks=[dark]).at(0).apply(images)
+    np.testing.assert_array_equal(found[:, 3, 4], 150 - np.nanmedian(dark))
+    dark[3, 4] = np.nanmedian(dark)
+    wanted = Equalisation.of(weighted, flags, darks=[dark]).at(0).apply(images)
+    np.testing.assert_array_equal(found, wanted)
+
+
 def test_a_fit_without_a_dark_is_refused():
     weighted = fitted()
     weighted = weighted._replace(exposures=dataclasses.replace(weighted.exposures, dark=None))

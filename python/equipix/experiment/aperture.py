@@ -16,6 +16,7 @@ from equipix.exposures.spots import ShiftMeasurement, Spot, hot_places, measure_
 from equipix.findings import usable
 from equipix.fitting.weighted import Weighted
 from equipix.measured.colour import Filters
+from equipix.measured.part import median
 from equipix.measured.saturation import saturation_level
 
 _AROUND = 8
@@ -104,14 +105,18 @@ class Equalisation:
         return replace(self, dark=self.darks[exposure][self.region].astype(self.gain.dtype))
 
     def apply(self, frames: Array) -> Array:
-        """Images of the aperture as equal pixels would have given them, where the maps are."""
+        """Images of the aperture as equal pixels would have given them, where the maps are.
+
+        A pixel without a dark takes the median, and the centroid corrects it as a bad one.
+        """
         shape = self.darks[0].shape if self.darks else self.gain.shape
         if frames.shape[-2:] != shape:
             raise InputError(
                 f"'calibration' is of a sensor of {shape}, the images of the aperture "
                 f"have {frames.shape[-2:]} pixels"
             )
-        return np.asarray((frames[..., *self.region] - self.dark) / self.gain)
+        dark = np.where(np.isnan(self.dark), median(self.dark), self.dark)
+        return np.asarray((frames[..., *self.region] - dark) / self.gain)
 
     def equal(self, raw: Array, level: float | None, hot: Bools | None) -> Array:
         """Images of equal pixels, whose hot ones are mended."""
