@@ -64,6 +64,43 @@ def written(name, time, light, *, seed=9, temperature=-10.0, **cards):
     return name
 
 
+class TestNotFinite:
+    @pytest.fixture
+    def holed(self, tmp_path, monkeypatch):
+        """Two files with 2 values that are not finite; one is that of the flagged pixel."""
+        monkeypatch.chdir(tmp_path)
+        for name, places in {"a.tif": [(3, 4), (5, 6)], "b.tif": [(1, 1), (2, 2)]}.items():
+            values = frames(5).astype(np.float32)
+            values[tuple(np.transpose(places))] = np.nan, np.inf
+            write_frames(Path(name), [values], nbytes=values.nbytes)
+        return ["a.tif", "b.tif"]
+
+    @pytest.mark.parametrize(
+        ("options", "outcome"),
+        [
+            *(({"flagged": each}, "stay so") for each in ("nan", "replace", "keep")),
+            *(
+                ({"dtype": "uint16", "flagged": each}, "look as if they were measured: .* float32")
+                for each in ("replace", "keep")
+            ),
+            ({"display": "linear"}, "look as if they were measured: .* no picture"),
+        ],
+    )
+    def test_they_are_counted_and_named_whatever_the_output(
+        self, response, holed, options, outcome
+    ):
+        words = f"b.tif: holds 2 values of good .* infinite, and 1 more with 1. .* they {outcome}"
+        with pytest.warns(InputWarning, match=words):
+            done = correct_files(response, holed, Path("out.tif"), **options)
+        assert [each.kind for each in done.findings] == ["not_finite"]
+
+    def test_good_frames_have_none(self, response, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        values = frames(5).astype(np.float32)
+        write_frames(Path("good.tif"), [values], nbytes=values.nbytes)
+        assert correct_files(response, ["good.tif"], Path("out.tif")).findings == ()
+
+
 class TestDarks:
     def test_of_several_each_file_takes_the_one_that_fits(self, response, night):
         source, darks = ["m31-7.fits", "m31-5.fits"], [f"master{k}.fits" for k in (1, 5, 10)]

@@ -1,6 +1,7 @@
 """Frames in files corrected, and pictures of them."""
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from equipix._check import LOG, Array, Display, Flagged, OutputType, Progress
+from equipix._check import LOG, Array, Bools, Display, Flagged, OutputType, Progress
 from equipix.correction.apply import FAST, Corrector, output_dtype, usual_treatment
 from equipix.correction.file_darks import (
     FileDarks,
@@ -141,6 +142,8 @@ def correct_files(
     InputWarning
         If frames are of another exposure time or temperature than their dark, or dark frames.
     InputWarning
+        If frames hold values that are not finite, in pixels that are not flagged.
+    InputWarning
         If most values had to be limited to the range of whole numbers.
     """
     wanted = _dtype(output, dtype, bit_depth, display)
@@ -156,12 +159,14 @@ def correct_files(
     options: dict[str, Any] = {"bit_depth": bit_depth, "flagged": flagged, "sensor": sensor}
     kind = "float32" if display else wanted
     prepared = partial(Corrector, correction, kind, workers=workers, **options)
-    work = _Correcting(correction.dark, darks, prepared, files[0])
+    good = usable(correction.flags)
+    work = _Correcting(correction.dark, good, darks, prepared, files[0])
     frames = partial(_frames, work, display, total, progress)
-    bad = int(np.count_nonzero(~usable(correction.flags)))
+    bad = int(np.count_nonzero(~good))
     beside = _Beside.of(headers, darks, origin, f"{bad} flagged pixels: {flagged}")
     _write_all(output, outputs, frames, wanted, beside, force=force)
     said += darks.findings + work.findings + warn_of_as_dark(work.as_dark, darks.names[0])
+    said += _warn_of_not_finite(work.not_finite, np.dtype(np.uint8) if display else wanted)
     made = work.corrector
     said += _warn_of_limited(made.clipped, total * correction.flags.size, wanted)
     counts = made.clipped, made.extrapolated, made.replaced, bad if flagged == "nan" else 0
@@ -174,16 +179,18 @@ class _Correcting:
     def __init__(
         self,
         stored: Array | None,
+        good: Bools,
         darks: FileDarks,
         prepared: Callable[..., Corrector],
         first: Path,
     ) -> None:
-        self._stored, self._darks, self._prepared = stored, darks, prepared
+        self._stored, self._good, self._darks, self._prepared = stored, good, darks, prepared
         self._file: Path | None = None
         self._shares, self._dark = darks.shares[first], darks.of(first)
         self.corrector = prepared(dark=self._dark)
         self.findings: Findings = ()
         self.as_dark: list[Path] = []
+        self.not_finite: Counter[Path] = Counter()
         self.done = 0
 
     def corrected(self, file: Path, frames: Array) -> Array:
@@ -191,6 +198,8 @@ class _Correcting:
         if file != self._file:
             self._go_on(file, frames[0])
         self.done += len(frames)
+        if lost := int(np.count_nonzero(~np.isfinite(frames) & self._good)):
+            self.not_finite[file] += lost
         native = frames.dtype.newbyteorder("=")
         return self.corrector.apply(
             frames.astype(native if native in FAST else np.float32, copy=False)
@@ -373,6 +382,24 @@ def warn_of_corrected(headers: Mapping[Path, Header], origin: str) -> Findings:
         "the raw frames"
     )
     return say(Finding("corrected", words, "input"))
+
+
+def _warn_of_not_finite(found: Counter[Path], dtype: np.dtype[Any]) -> Findings:
+    """Warn of values of good pixels that are NaN or infinite, with the file that has most."""
+    if not found:
+        return ()
+    (file, count), *others = found.most_common()
+    more = f", and {len(others)} more with {found.total() - count}" if others else ""
+    outcome = (
+        "look as if they were measured: write 'dtype' (--dtype) float32, no picture, to keep them"
+    )
+    if dtype.kind == "f":
+        outcome = "stay so: leave these frames out, or see what wrote them"
+    words = (
+        f"{file}: holds {count} values of good pixels that are NaN or infinite{more}. In the "
+        f"output they {outcome}"
+    )
+    return say(Finding("not_finite", words, "input"))
 
 
 def _warn_of_limited(limited: int, values: int, dtype: np.dtype[Any]) -> Findings:
