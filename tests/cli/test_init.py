@@ -39,11 +39,11 @@ def write(path, level, count=1):
     write_frames(path, frames, nbytes=frames.nbytes)
 
 
-def write_fits(path, time, temperature=-10.0, level=100):
+def write_fits(path, time, temperature=-10.0, level=100, **cards):
     """Write a frame with the settings that it was taken with."""
     path.parent.mkdir(parents=True, exist_ok=True)
     frame = np.random.default_rng(level).poisson(level, (16, 20)).astype(np.uint16)
-    fits.writeto(path, frame, fits.Header({"EXPTIME": time, "CCD-TEMP": temperature}))
+    fits.writeto(path, frame, fits.Header({"EXPTIME": time, "CCD-TEMP": temperature} | cards))
 
 
 @pytest.fixture
@@ -92,6 +92,25 @@ class TestExperiment:
             (["dark-0.fits", "dark-3.fits"], 1.0, -10.0),
             (["dark-1.fits", "dark-4.fits"], 4.0, -10.1),
             ("dark-2.fits", 1.0, -20.0),
+        ]
+
+    def test_headers_say_which_images_are_dark(self, run, tmp_path):
+        """As capture programs write them: one name, and the type in the header."""
+        types = ["Dark Frame", "Bias Frame", "Dark Frame", "Light Frame", "FLAT"]
+        for k, each in enumerate(types):
+            write_fits(tmp_path / f"img_{k:04}.fits", 1.0, level=100 + k, IMAGETYP=each)
+        write_fits(tmp_path / "dark/0.fits", 1.0, level=200, OBSTYPE="OBJECT")
+        write_fits(tmp_path / "hole/0.fits", 1.0, level=201, FRAME="dark")
+        status, _, err = run("init", "experiment", tmp_path)
+        assert status == 0
+        assert "not used: 'img_0001.fits' (is 'Bias Frame' by its header (IMAGETYP))" in err
+        found = tomllib.loads((tmp_path / "experiment.toml").read_text())
+        assert [each["frames"] for each in found["dark"]] == [
+            ["img_0000.fits", "img_0002.fits", "hole/0.fits"]
+        ]
+        assert [each["frames"] for each in found["exposure"]] == [
+            ["img_0003.fits", "img_0004.fits"],
+            "dark/0.fits",
         ]
 
     def test_darks_of_unknown_times_are_asked_for_by_folder(self, run, tmp_path):

@@ -399,6 +399,35 @@ def test_an_average_says_what_its_dark_was_taken_with(tmp_path, camera, run):
     ]
 
 
+@pytest.mark.parametrize(
+    ("name", "shown", "words"),
+    [
+        ("dark.fits", "Light Frame", r"'dark.fits' in \[dark\] is 'Light .*, expected dark frames"),
+        ("p1.fits", "Dark Frame", r"'p1.fits' in 'frames' of exposure 'p1' is 'Dark Frame' by its"),
+        ("p0.fits", "bias", r"is 'bias' by its header \(IMAGETYP\), expected frames with light"),
+    ],
+)
+def test_a_header_of_another_type_of_image_is_named(tmp_path, name, shown, words):
+    text = "[sensor]\nbit_depth = 16\n\n" + entry("dark", "dark.fits")
+    for k, each in enumerate(("dark.fits", "p0.fits", "p1.fits")):
+        shift = f'name = "p{k - 1}"\nshift = [0, {k}]\n'
+        text += entry("exposure", each) + shift if k else ""
+        header = fits.Header({"IMAGETYP": shown} if each == name else {})
+        fits.writeto(tmp_path / each, np.full((16, 20), 100 + k, np.uint16), header)
+    (tmp_path / "experiment.toml").write_text(text)
+    with pytest.raises(errors.FileError, match=words):
+        Experiment.load(tmp_path / "experiment.toml").run()
+
+
+def test_a_level_may_be_dark_frames_and_its_dark_no_light(tmp_path, camera):
+    path = fits_levels(tmp_path, camera)
+    fits.setval(tmp_path / "level1.fits", "IMAGETYP", value="DARK")
+    LevelExperiment.load(path).run()
+    fits.setval(tmp_path / "dark1.fits", "IMAGETYP", value="FLAT")
+    with pytest.raises(errors.FileError, match=r"'dark1.fits' in .* is 'FLAT' by its header"):
+        LevelExperiment.load(path).run()
+
+
 def test_files_of_one_entry_that_contradict_one_another_are_named(tmp_path, camera):
     path = fits_levels(tmp_path, camera)
     path.write_text(path.read_text().replace('"level2.fits"', '["level2.fits", "level3.fits"]', 1))

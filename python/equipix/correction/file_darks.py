@@ -49,9 +49,6 @@ _QUOTE = (
 _WORDED = ("stored", "none")
 """What stands in the place of names of darks."""
 
-_LIGHT = ("light", "object", "science", "flat")
-"""What types of images with light contain."""
-
 _SAMPLED = 2**16  # pixels that show whether a frame is dark
 
 
@@ -184,12 +181,9 @@ def _suspects(
 def _refuse_light(darks: Sequence[FrameFile]) -> None:
     """Refuse frames that are no dark by their headers."""
     for file in darks:
-        value, keyword = file.image_type
-        shown = value.lower()
-        if "dark" not in shown and any(word in shown for word in _LIGHT):
+        if file.image_type.kind == "light":
             raise FileError(
-                f"{file.path}: is '{value}' by its header ({keyword}), expected dark frames in "
-                "'dark' (--dark)"
+                f"{file.path}: is {file.image_type}, expected dark frames in 'dark' (--dark)"
             )
 
 
@@ -200,7 +194,7 @@ def _some(files: Sequence[Path]) -> str:
 
 def _warn_of_dark_frames(headers: Mapping[Path, Header]) -> Findings:
     """Warn of frames that are dark frames by their headers."""
-    files = [file for file, each in headers.items() if "dark" in each.image_type.value.lower()]
+    files = [file for file, each in headers.items() if each.image_type.kind == "dark"]
     if not files:
         return ()
     words = f"{_some(files)}: given as frames, but dark frames by their headers: {_QUOTE}"

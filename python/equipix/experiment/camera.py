@@ -13,7 +13,7 @@ from equipix._check import Floats, Progress, ReadOnly, naming_memory
 from equipix.detector.photons import EV_UM
 from equipix.errors import FileError, InputError
 from equipix.experiment.described import Described
-from equipix.experiment.image_files import check_formats, entries_of, sha256_of
+from equipix.experiment.image_files import check_formats, entries_of, refuse_other_types, sha256_of
 from equipix.experiment.manifest import (
     CameraExposure,
     CameraLight,
@@ -285,6 +285,7 @@ class CameraExperiment(Described[CameraManifest]):
                 shape = check_formats([entries[0].files[0], *entry.files])
             except FileError as error:
                 raise FileError(f"{self.path}, {entry}: {error}") from error
+        refuse_other_types(self.path, self.manifest)
         return shape
 
     def _evaluated(

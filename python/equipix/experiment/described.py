@@ -28,6 +28,7 @@ from equipix.experiment.image_files import (
     check_formats,
     completed,
     image_files,
+    refuse_other_types,
     refuse_repeats,
     sha256_of,
 )
@@ -195,10 +196,12 @@ class Described(Brief, Generic[_Manifest]):
         Raises
         ------
         FileError
-            If images differ in shape or depth, or two are the same; if the mask file is of another
-            shape, a region reaches beyond the sensor, or nothing is left.
+            If images differ in shape or depth, two are the same, or a header names another type of
+            image; if the mask file is of another shape, a region reaches beyond the sensor, or
+            nothing is left.
         """
         shape: tuple[int, int] = check_formats(image_files(self.path, self.manifest))
+        refuse_other_types(self.path, self.manifest)
         count = len(self.manifest.measurements)
         given = None if mask is None else as_mask(mask, (count, *shape))
         excluded = union(given, self._excluded(shape))

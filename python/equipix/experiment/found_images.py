@@ -1,4 +1,4 @@
-"""Image files of a folder, by what their names and headers say: light, dark, or of a hole."""
+"""Image files of a folder, by what their headers and names say: light, dark, or of a hole."""
 
 import re
 from collections import Counter
@@ -13,7 +13,9 @@ from equipix.correction.correct_files import is_corrected
 from equipix.errors import EquipixError, FileError
 from equipix.experiment.manifest import Sensor
 from equipix.io import camera_raw
-from equipix.io.frames import Settings, apart, has_format, header, settings
+from equipix.io.fits import ImageType
+from equipix.io.formats import FrameFile
+from equipix.io.frames import Settings, apart, has_format, header
 from equipix.io.paths import find_files
 from equipix.measured.statistics import saved_shape
 
@@ -40,6 +42,12 @@ class ImageGroup(NamedTuple):
     frames: int = 1
     settings: Settings = Settings()
     saved: bool = False
+    image_type: ImageType = ImageType()
+
+    @property
+    def is_dark(self) -> bool:
+        """Whether its files are dark frames by their headers, or else by their names."""
+        return _is_dark(self.image_type, self.place)
 
     def is_named(self, kind: re.Pattern[str]) -> bool:
         """Whether its files are of a kind by their names."""
@@ -76,11 +84,14 @@ class FoundImages(NamedTuple):
 def find_images(folder: Path, start: Path) -> FoundImages:
     """Find the images in a folder and two folders deep; their names begin at `start`."""
     groups, left = _groups(folder, start)
-    holes = [each for each in groups if each.is_named(_HOLE)]
+    bias = [each for each in groups if each.image_type.kind == "bias"]
+    groups = [each for each in groups if each not in bias]
+    holes = [each for each in groups if each.is_named(_HOLE) and each.image_type.kind != "dark"]
     other = [each for each in groups if each.is_named(_OTHER) and each not in holes]
     rest = [each for each in groups if each not in (*holes, *other)]
-    dark = _raw_first([each for each in rest if each.is_named(_DARK)], left)
-    light = _raw_first([each for each in rest if not each.is_named(_DARK)], left)
+    dark = _raw_first([each for each in rest if each.is_dark], left)
+    light = _raw_first([each for each in rest if not each.is_dark], left)
+    left |= {name: f"is {each.image_type}" for each in bias for name in each.files}
     left |= {name: "no frames of the sensor by its name" for each in other for name in each.files}
     return FoundImages(light, dark, [name for each in holes for name in each.files], left)
 
@@ -92,7 +103,7 @@ def settings_differ(one: Settings, other: Settings, temperature_tolerance: float
 
 
 def _groups(folder: Path, start: Path) -> tuple[list[ImageGroup], dict[str, str]]:
-    """Group the images in a folder by their names but for the last number, and by settings.
+    """Group the images in a folder by their names but for the last number, type and settings.
 
     Files that hold no frames of a sensor stand in the second value, with the reason.
     """
@@ -123,11 +134,13 @@ def _groups_of(
     Those that are `alone` in their folder have its name.
     """
     series = _by_settings([*counts], folder)
-    for held, files in series:
+    for held, image_type, files in series:
         time = "" if len(series) == 1 or held.exposure_s is None else f"-{held.exposure_s:g}s"
         names = [_relative(file, start) for file in files]
         place, entry = relpath(files[0], folder), _entry(names, start)
-        group = ImageGroup(name + time, place, names, entry, len(files), held)
+        group = ImageGroup(
+            name + time, place, names, entry, len(files), held, image_type=image_type
+        )
         if len(files) > 1 and counts[files[0]] == 1:
             yield group
             continue
@@ -148,20 +161,27 @@ def _frame_count(file: Path) -> int:
     return found.shape[0]
 
 
-def _by_settings(files: list[Path], folder: Path) -> list[tuple[Settings, list[Path]]]:
-    """Part files by their exposure times, dark frames by their temperatures too."""
-    is_dark = _DARK.search(relpath(files[0], folder).lower())
-    tolerance = Sensor().dark_temperature_tolerance_c if is_dark else float("inf")
-    found: list[tuple[Settings, list[Path]]] = []
-    for file in files:
-        held = settings(file)
-        for other, alike in found:
-            if not settings_differ(held, other, tolerance):
-                alike.append(file)
+def _by_settings(files: list[Path], folder: Path) -> list[tuple[Settings, ImageType, list[Path]]]:
+    """Part files by types of images and exposure times, dark frames by their temperatures too."""
+    place = relpath(files[0], folder)
+    found: list[tuple[Settings, ImageType, list[Path]]] = []
+    for file in map(FrameFile, files):
+        held, shown = file.settings, file.image_type
+        is_dark = _is_dark(shown, place)
+        tolerance = Sensor().dark_temperature_tolerance_c if is_dark else float("inf")
+        for other, other_type, alike in found:
+            if shown.kind == other_type.kind and not settings_differ(held, other, tolerance):
+                alike.append(file.path)
                 break
         else:
-            found.append((held, [file]))
+            found.append((held, shown, [file.path]))
     return found
+
+
+def _is_dark(image_type: ImageType, place: str) -> bool:
+    """Whether files are dark frames by their headers, or else by their names."""
+    kind = image_type.kind
+    return kind == "dark" if kind else _DARK.search(place.lower()) is not None
 
 
 def _relative(file: Path, start: Path) -> str:

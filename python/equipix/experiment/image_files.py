@@ -20,7 +20,7 @@ from equipix.experiment.manifest import (
 )
 from equipix.io import binary, camera_raw
 from equipix.io.arrays import split
-from equipix.io.formats import refuse_saved
+from equipix.io.formats import FrameFile, refuse_saved
 from equipix.io.frames import frame_format, read_frames
 from equipix.io.paths import reading
 from equipix.measured.colour import Colours
@@ -175,6 +175,31 @@ def refuse_repeated_files(frames: list[Path], dark: list[Path]) -> dict[Path, st
                 f"{_words(one, other)} in the frames and in 'dark': give each its own frames"
             )
     return found
+
+
+def refuse_other_types(path: Path, manifest: AnyManifest) -> None:
+    """Refuse FITS files whose headers say that they hold other images than their key wants.
+
+    An exposure has light, and so has an image of a hole. A level may have none.
+
+    Raises
+    ------
+    FileError
+        With the file, its header and where it stands.
+    """
+    for entry in entries_of(path, manifest):
+        if entry.key == "dark":
+            refused, wanted = ["light"], "dark frames"
+        elif isinstance(manifest, Manifest):
+            refused, wanted = ["dark", "bias"], "frames with light"
+        else:
+            continue
+        for file in map(FrameFile, entry.files):
+            if file.image_type.kind in refused:
+                raise FileError(
+                    f"{path}: '{file.path.name}' in {entry} is {file.image_type}, expected "
+                    f"{wanted}: name them instead, or correct the header"
+                )
 
 
 def image_files(path: Path, manifest: AnyManifest) -> list[Path]:

@@ -32,6 +32,13 @@ _OF_VALUES = ("BSCALE", "BZERO", "BLANK", "DATAMIN", "DATAMAX", "CHECKSUM", "DAT
 _TYPES = ("IMAGETYP", "OBSTYPE", "FRAME")
 """Keywords of what an image shows."""
 
+_KINDS = {
+    "dark": ("dark",),
+    "bias": ("bias",),
+    "light": ("light", "object", "science", "flat"),
+}
+"""What the words on types of images contain, of several the first."""
+
 _USES = {"flat": "divide frames by it", "gain": "multiply frames by it"}
 
 _BESIDE = ("UNCERT", "ERR", "ERROR", "VAR", "VARIANCE", "IVAR", "MASK", "DQ", "WHT", "WEIGHT")
@@ -111,6 +118,17 @@ class ImageType(NamedTuple):
 
     value: str = ""
     keyword: str = ""
+
+    @property
+    def kind(self) -> str:
+        """What it is in short: dark, bias or light; nothing of other words. A flat dark is dark."""
+        shown = self.value.lower()
+        named = (kind for kind, words in _KINDS.items() if any(word in shown for word in words))
+        return next(named, "")
+
+    def __str__(self) -> str:
+        """Return the words for a message."""
+        return f"'{self.value}' by its header ({self.keyword})"
 
 
 Header = tuple[
