@@ -145,6 +145,16 @@ class TestExperiment:
         path = filled(tmp_path / "experiment.toml", shift="[0, 5]")
         assert Experiment.load(path).manifest.dark is None
 
+    def test_raw_files_beside_a_saved_dark_hold_their_level_and_time(self, run, tmp_path):
+        for k, name in enumerate(("dark", "p0", "p1")):
+            write_dng(tmp_path / f"{name}.dng", np.full((100, 122), 100 + k, np.uint16))
+        equipix.average(tmp_path / "dark.dng").save(tmp_path / "dark.tif")
+        (tmp_path / "dark.dng").unlink()
+        assert run("init", "experiment", tmp_path)[0] == 0
+        text = (tmp_path / "experiment.toml").read_text()
+        assert "bit_depth" not in tomllib.loads(text)["sensor"]
+        assert "exposure_s = 0.02\n" in text
+
     def test_a_blank_is_refused_by_name(self, run, folders):
         run("init", "experiment", folders)
         with pytest.raises(

@@ -78,8 +78,17 @@ def test_pattern_and_saturation_are_those_of_the_files(folder):
 def test_what_the_manifest_gives_is_kept(folder):
     sensor = '[sensor]\nbit_depth = 13\ncfa = [["R", "G1"], ["G2", "B"]]\n[dark]'
     found = Experiment.load(edited(folder, "dng", (r"\[dark\]", sensor))).manifest.sensor
-    assert (found.bit_depth, found.saturation) == (13, None)
+    assert found.bit_depth == 13
     assert found.cfa == [["R", "G1"], ["G2", "B"]]
+
+
+@pytest.mark.parametrize(
+    ("given", "level"),
+    [("bit_depth = 14", 4095), ("bit_depth = 10", 1023), ("saturation = 5e3", 5000)],
+)
+def test_bits_alone_do_not_raise_the_level_of_a_file(folder, given, level):
+    path = edited(folder, "dng", (r"\[dark\]", f"[sensor]\n{given}\n[dark]"))
+    assert Experiment.load(path).manifest.sensor.saturation_level == level
 
 
 def test_another_pattern_is_refused(folder):

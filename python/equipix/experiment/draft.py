@@ -63,7 +63,7 @@ def draft_manifest(kind: str, folder: Path, start: Path) -> Draft:
     values = values_of(found._replace(light=light, dark=dark))
     unused = _unused(found, values)
     findings = (*_findings(found, folder, unused),)
-    sensor = {} if found.hold_saturation else {"bit_depth": BLANK}
+    sensor = {} if found.raw else {"bit_depth": BLANK}
     title = " ".join([*(each.message + "." for each in findings if each.kind == "images"), _TITLE])
     text = template(model, title, {"sensor": sensor, **values}) + _comments(unused)
     blanks = text.count(f' = "{BLANK}"')
@@ -127,7 +127,7 @@ def _experiment(found: FoundImages) -> dict[str, Any]:
             position = {"shift": BLANK}
         given = {"name": name, "frames": group.entry}
         exposures.append(given | (position if exposures else {}))
-    needs_none = found.hold_saturation and not found.dark
+    needs_none = found.raw and found.raw == found.files and not found.dark
     darks = [] if needs_none else _dark_tables(found.dark) or [{"frames": BLANK}]
     return {"exposure": exposures} | ({"dark": darks} if darks else {})
 

@@ -75,10 +75,9 @@ class FoundImages(NamedTuple):
         return [*self.holes, *(name for each in groups for name in each.files)]
 
     @property
-    def hold_saturation(self) -> bool:
-        """Whether the files hold the level of saturation themselves."""
-        files = self.files
-        return bool(files) and all(name.lower().endswith(camera_raw.SUFFIXES) for name in files)
+    def raw(self) -> list[str]:
+        """Those that are raw files of cameras, which hold their black and white level."""
+        return [name for name in self.files if name.lower().endswith(camera_raw.SUFFIXES)]
 
 
 def find_images(folder: Path, start: Path) -> FoundImages:

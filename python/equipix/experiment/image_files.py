@@ -76,8 +76,9 @@ def completed(path: Path, manifest: _Manifest) -> _Manifest:
     own: dict[str, object] = {}
     if sensor.saturation_level is None and manifest.layout is not None:
         own["bit_depth"] = binary.FORMATS[manifest.layout.pixel]
-    elif sensor.saturation_level is None and told:
-        own["saturation"] = float(min(each.white for each in told.values()))
+    elif sensor.saturation is None and told:
+        white = min(each.white for each in told.values())
+        own["saturation"] = float(min(white, sensor.largest or white))
     given, whence = Colours.of(sensor.cfa), "'cfa' in [sensor]"
     for file, each in told.items():
         found = Colours.of(each.cfa)

@@ -46,7 +46,9 @@ def header(
     """Shape (1, rows, cols) and dtype of the counts, no text, and the exposure time in seconds."""
     with _opened(path) as raw:
         shape = (1, raw.sizes.height, raw.sizes.width)
-        return shape, np.dtype(np.uint16), "", (float(raw.other.shutter_speed) or None,)
+        # LibRaw has a float of 32 bits: its shortest decimal is what the camera wrote, as 0.02.
+        time = float(str(np.float32(raw.other.shutter_speed)))
+        return shape, np.dtype(np.uint16), "", (time or None,)
 
 
 def stream_frames(path: Path) -> Iterator[NDArray[Any]]:
