@@ -198,5 +198,11 @@ def test_measurements_left_out_add_a_remedy_to_a_fit_far_from_its_minimum(ended,
     plain = coverage.too_far(evidence)
     assert remedy in plain
     fit.lost = [[3], [1, 4]]
+    assert coverage.too_far(evidence) == plain
+    dead = np.zeros(taken.shape, bool)
+    dead[3, 4] = True
+    evidence.exposures = taken.marked(dead=dead).without(dead)
+    assert coverage.too_far(evidence) == plain
+    evidence.exposures = taken.without(dead)
     more = coverage.too_far(evidence)
     assert more.startswith(f"{plain}. Besides, 3 measurements along ragged edges")

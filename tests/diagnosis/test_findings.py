@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -130,11 +131,17 @@ def test_standard_deviations_are_missed_only_where_asked_for_after_a_joint_fit(
     ],
 )
 def test_measurements_left_out_add_a_remedy_and_take_none(evidence, found, remedy):
-    """Whatever their number: one of a million says little of why a search did not end."""
+    """Where there is a mask, whatever their number: one of a million says little of the search."""
     found = {"error_estimate": np.array([1e-3]), "lost": []} | found
     plain = findings_on(evidence, **found, uncertainty=False)[-1].message
     assert remedy in plain
     assert "left out" not in plain
+    lost = found | {"lost": [[], [7]]}
+    assert findings_on(evidence, **lost, uncertainty=False)[-1].message == plain
+    mask = np.zeros(evidence.exposures.shape, bool)
+    mask[:, :3] = True
+    masked = evidence.exposures.without(mask)
+    evidence = dataclasses.replace(evidence, weighted=evidence.weighted._replace(exposures=masked))
     one, many = (
         findings_on(evidence, **found | {"lost": lost}, uncertainty=False)[-1].message
         for lost in ([[], [7]], [[1, 2], [7]])
@@ -144,6 +151,20 @@ def test_measurements_left_out_add_a_remedy_and_take_none(evidence, found, remed
         "many, use masks with smooth edges"
     )
     assert many.startswith(f"{plain}. Besides, 3 measurements along ragged edges of masks were ")
+
+
+@pytest.mark.parametrize(
+    ("most", "words"),
+    [
+        (2, r" 8 sweeps \(limit 2; the step that was begun is completed\): the"),
+        (8, " 8 sweeps: the"),
+    ],
+)
+def test_sweeps_beyond_their_limit_are_explained(evidence, most, words):
+    options = dataclasses.replace(evidence.options, fit=FitOptions(max_sweeps=most))
+    found = {"ended": "sweeps used", "sweeps": np.array([8]), "error_estimate": np.array([1e-3])}
+    limited = dataclasses.replace(evidence, options=options)
+    assert re.search(words, findings_on(limited, **found, uncertainty=False)[-1].message)
 
 
 def experiment(noise=1e-3, contrast=0.0, shifts=CROSS + 0.25):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from equipix import _native
-from equipix._check import Bools
+from equipix._check import Bools, union
 from equipix._native import Fit
 from equipix.diagnosis.evidence import Evidence
 from equipix.exposures.exposures import Exposures
@@ -36,10 +36,15 @@ def why_weak(exposures: Exposures) -> str:
     return f"the positions do not determine the sensitivity, since {cause}" if cause else TOO_WEAK
 
 
-def left_out(fit: Fit) -> str:
-    """Words on the measurements that a fit lost, another cause of slow convergence; or none."""
+def left_out(exposures: Exposures, fit: Fit) -> str:
+    """Words on the measurements that a fit lost along masks, another cause of slow convergence.
+
+    None where nothing is masked: a few are lost beside bad pixels too, which need no remedy.
+    """
     count = sum(map(len, fit.lost))
-    if not count:
+    found = union(*vars(exposures.bad_pixels).values())
+    masked = exposures.mask if found is None or exposures.mask is None else exposures.mask & ~found
+    if not count or masked is None or not masked.any():
         return ""
     return (
         f". Besides, {count} measurement{'s' * (count != 1)} along ragged edges of masks "
@@ -50,7 +55,7 @@ def left_out(fit: Fit) -> str:
 
 def too_far(evidence: Evidence) -> str | None:
     """Say that the fit ended so far from its minimum that it determines no pixel."""
-    fit = evidence.fit
+    fit, exposures = evidence.fit, evidence.exposures
     error = float(fit.error_estimate[-1])
     if error <= FAR:  # a NaN is not
         return None
@@ -60,7 +65,7 @@ def too_far(evidence: Evidence) -> str | None:
     return (
         "the fit ended far from its minimum, and determines no pixel (estimated relative error "
         f"{error:.1e}, limit {FAR:g}): "
-        f"{why_weak(evidence.exposures) if fits_noise(fit) else more}{left_out(fit)}"
+        f"{why_weak(exposures) if fits_noise(fit) else more}{left_out(exposures, fit)}"
     )
 
 

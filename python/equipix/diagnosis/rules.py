@@ -151,15 +151,16 @@ def _on_convergence(e: Evidence) -> str | None:
             "almost no light"
         )
     sweeps, error = int(fit.sweeps[-1]), float(fit.error_estimate[-1])
+    most, after = e.options.fit.max_sweeps, f"not converged after {sweeps} sweeps"
+    if most is not None and sweeps > most:
+        after += f" (limit {most}; the step that was begun is completed)"
     if error <= tolerance:
         few = fit.ended == "sweeps used"
         cause = "allow more" if few else "probably most pixels saturate or have no light"
-        return (
-            f"not converged after {sweeps} sweeps, which are too few to estimate the error: {cause}"
-        )
+        return f"{after}, which are too few to estimate the error: {cause}"
     return (
-        f"not converged after {sweeps} sweeps: the estimated error is {error:.1e}, above the "
-        f"tolerance {tolerance:g}{remedy}{left_out(fit)}"
+        f"{after}: the estimated error is {error:.1e}, above the tolerance {tolerance:g}{remedy}"
+        f"{left_out(e.exposures, fit)}"
     )
 
 
