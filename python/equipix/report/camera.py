@@ -39,28 +39,28 @@ _FINE: Any = {"linewidth": 0.8}
 class Figure(NamedTuple):
     """A figure: its key, its name and unit for people, and its value, NaN where it is not known.
 
-    `told` says that the value is a bound, "below" or "above"; of none, why it is not known.
+    `note` says that the value is a bound, "below" or "above"; of none, why it is not known.
     """
 
     key: str
     name: str
     unit: str
     value: float
-    told: str = ""
+    note: str = ""
 
     @property
     def number(self) -> str:
         """The value in digits."""
         if not np.isfinite(self.value):
-            return self.told or "not known"
+            return self.note or "not known"
         number = f"{self.value:{'.0f' if abs(self.value) >= _WHOLE else '.4g'}}"
-        return f"{self.told} {number}".strip()
+        return f"{self.note} {number}".strip()
 
 
 def bounds_of(found: CameraFigures) -> dict[str, str]:
     """Keys of the figures that are bounds, "below" or "above", for programs."""
     return {
-        each.key: each.told for each in figures_of(found) if each.told and np.isfinite(each.value)
+        each.key: each.note for each in figures_of(found) if each.note and np.isfinite(each.value)
     }
 
 
@@ -88,12 +88,12 @@ def figures_of(found: CameraFigures) -> Iterator[Figure]:
     name, inverse = "inverse of the largest SNR", 100 / t.snr_max
     yield Figure("inverse_snr_max_percent", name, "%", inverse, "below" if of_light else "")
     least, least_e = known * t.threshold_light, known * t.threshold_e
-    for key, name, photons, electrons, told in (
+    for key, name, photons, electrons, note in (
         ("threshold", "absolute sensitivity threshold", least, least_e, of_noise),
         ("saturation", "saturation capacity", t.saturation_light, t.saturation_e, of_light),
     ):
-        yield _in_photons(found, Figure(f"{key}_photons", name, "photons", photons, told))
-        yield Figure(f"{key}_e", name, "e⁻", electrons, told)
+        yield _in_photons(found, Figure(f"{key}_photons", name, "photons", photons, note))
+        yield Figure(f"{key}_e", name, "e⁻", electrons, note)
     yield from _with_logarithms("dynamic_range", "dynamic range", known * t.dynamic_range, of_range)
     if found.spatial is not None:
         dsnu, prnu = found.spatial.dsnu, found.spatial.prnu
@@ -112,12 +112,12 @@ def _dark_currents(found: CameraFigures) -> Iterator[Figure]:
     if found.off[:, 1].min() < QUANTISED:
         below[1] = np.nan
     for by, bound in zip(("mean", "variance"), below.tolist(), strict=True):
-        value, told = getattr(t, f"dark_current_{by}"), ""
+        value, note = getattr(t, f"dark_current_{by}"), ""
         if np.isnan(value) and few:
-            told = _NO_TIMES
+            note = _NO_TIMES
         elif np.isnan(value) and bound > 0:  # 0 of equal darks, which tell nothing
-            value, told = bound, "below"
-        yield Figure(f"dark_current_{by}_e_per_s", f"dark current by the {by}", "e⁻/s", value, told)
+            value, note = bound, "below"
+        yield Figure(f"dark_current_{by}_e_per_s", f"dark current by the {by}", "e⁻/s", value, note)
 
 
 def _parts(kind: str, ending: str, unit: str, split: Split) -> Iterator[Figure]:
@@ -127,10 +127,10 @@ def _parts(kind: str, ending: str, unit: str, split: Split) -> Iterator[Figure]:
         yield Figure(f"{kind}_{part}{ending}", f"{kind.upper()}, {part}", unit, value)
 
 
-def _with_logarithms(key: str, name: str, ratio: float, told: str) -> Iterator[Figure]:
-    yield Figure(key, name, "", ratio, told)
-    yield Figure(f"{key}_db", name, "dB", float(20 * np.log10(ratio)), told)
-    yield Figure(f"{key}_bits", name, "bit", float(np.log2(ratio)), told)
+def _with_logarithms(key: str, name: str, ratio: float, note: str) -> Iterator[Figure]:
+    yield Figure(key, name, "", ratio, note)
+    yield Figure(f"{key}_db", name, "dB", float(20 * np.log10(ratio)), note)
+    yield Figure(f"{key}_bits", name, "bit", float(np.log2(ratio)), note)
 
 
 def _has_photons(found: CameraFigures) -> bool:
@@ -141,7 +141,7 @@ def _has_photons(found: CameraFigures) -> bool:
 def _in_photons(found: CameraFigures, figure: Figure) -> Figure:
     """Return a figure; without a value where the light is in another unit than photons."""
     known = _has_photons(found)
-    return figure if known else figure._replace(value=np.nan, told="needs photons")
+    return figure if known else figure._replace(value=np.nan, note="needs photons")
 
 
 def _light(found: CameraFigures) -> str:
@@ -170,10 +170,12 @@ def _side_by_side(planes: dict[str, CameraFigures]) -> Table:
 def camera_checks(found: CameraFigures, limits: CameraLimits) -> list[Check]:
     """Judge the figures of a plane by limits."""
     figures = {each.key: each for each in figures_of(found)}
-    told = {key: each.told for key, each in figures.items()}
+    notes = {key: each.note for key, each in figures.items()}
     if found.spatial is None:
-        told |= dict.fromkeys(("dsnu_e", "prnu_percent"), "not measured (add [spatial])")
-    return checked(limits, {key: each.value for key, each in figures.items()}, found.findings, told)
+        notes |= dict.fromkeys(("dsnu_e", "prnu_percent"), "not measured (add [spatial])")
+    return checked(
+        limits, {key: each.value for key, each in figures.items()}, found.findings, notes
+    )
 
 
 def camera_parts(

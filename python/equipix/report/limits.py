@@ -154,12 +154,12 @@ def checked(
     limits: FindingLimits,
     figures: Mapping[str, Any],
     findings: Iterable[Finding] | None,
-    told: Mapping[str, str] | None = None,
+    notes: Mapping[str, str] | None = None,
 ) -> list[Check]:
     """Compare figures and findings with limits.
 
     A figure that is not known fails. None is one that the result does not have: it is not judged.
-    What is `told` of a figure is "below" or "above" of a bound, or why it is not known.
+    The note on a figure is "below" or "above" of a bound, or why it is not known.
     """
     fields = type(limits).model_fields
     return [
@@ -169,7 +169,7 @@ def checked(
             name,
             limit,
             figures.get(name, math.nan),
-            (told or {}).get(name, ""),
+            (notes or {}).get(name, ""),
             least="at least" in fields[name].metadata,
         )
         for name, limit in limits
@@ -182,11 +182,11 @@ def _of_findings(findings: Iterable[Finding] | None, severest: Severity) -> Chec
     if findings is None:
         return Check("findings", _NONE, wanted, None)
     worst = max((SEVERITIES.index(each.severity) for each in findings), default=-1)
-    told = "none" if worst < 0 else SEVERITIES[worst]
-    return Check("findings", told, wanted, worst <= SEVERITIES.index(severest))
+    words = "none" if worst < 0 else SEVERITIES[worst]
+    return Check("findings", words, wanted, worst <= SEVERITIES.index(severest))
 
 
-def _of_figure(name: str, limit: Any, value: Any, told: str, *, least: bool) -> Check:
+def _of_figure(name: str, limit: Any, value: Any, note: str, *, least: bool) -> Check:
     if isinstance(limit, bool):
         return Check(name, _words(value), _words(limit), value is limit)
     low, high = limit if isinstance(limit, list) else (-math.inf, limit)
@@ -198,11 +198,11 @@ def _of_figure(name: str, limit: Any, value: Any, told: str, *, least: bool) -> 
     values = [*value.values()] if isinstance(value, dict) else [value]
     passed = all(low <= each <= high for each in values)
     words = ", ".join(map(_words, values))
-    if told in _OPEN:
+    if note in _OPEN:
         # All values that a bound allows must pass.
-        passed, words = passed and low <= _OPEN[told] <= high, f"{told} {words}"
-    elif told and not passed:
-        words = told
+        passed, words = passed and low <= _OPEN[note] <= high, f"{note} {words}"
+    elif note and not passed:
+        words = note
     return Check(name, words, wanted, passed)
 
 
