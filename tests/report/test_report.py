@@ -21,6 +21,7 @@ from report_results import SHAPE, calibration, every_kind, measured
 import equipix
 from equipix import detector, hardware, lens, metrics, nuc, plan, scene, simulate
 from equipix.errors import FileError
+from equipix.findings import Finding
 from equipix.pictures import new_figure
 from equipix.report import camera
 from equipix.report.drawing import (
@@ -205,9 +206,23 @@ def test_errors_of_m_count_the_drift_once(results):
     assert table.caption == (
         "The estimated error that the solver left, 1.5e-05, is no standard deviation."
     )
-    plain = dataclasses.replace(cal, drift=None, sensitivity_std=None, tilt_std=None)
+    steady = dataclasses.replace(drift, size=0.0, tilt_std=np.zeros(2))
+    plain = dataclasses.replace(cal, drift=steady, findings=(), sensitivity_std=None, tilt_std=None)
     (table,) = (each for each in part_of("it", plain, NOTHING).tables if "cause" in each.title)
-    assert table.rows == [("Noise", "not computed", "calibrate with --uncertainty")]
+    assert table.rows == [
+        ("Noise, of a pixel", "not known", "calibrate with --uncertainty"),
+        ("Noise, of the tilt", "not known", "calibrate with --uncertainty"),
+        (
+            "Drift of the lamp",
+            "0, 0",
+            "in the tilt; the drift is smaller than the noise of the fluxes",
+        ),
+    ]
+    failed = Finding("uncertainty", "the fit is too far from its minimum", "convergence")
+    plain = dataclasses.replace(plain, drift=None, findings=(failed,))
+    (table,) = (each for each in part_of("it", plain, NOTHING).tables if "cause" in each.title)
+    assert {row[1] for row in table.rows} == {"not known"}
+    assert "see its findings" in table.rows[0]
 
 
 def test_dead_and_hot_pixels_are_listed_before_those_of_a_mask(results):
@@ -343,6 +358,14 @@ class TestLimits:
         (check,) = part_of("three", alike, read_limits(path)).checks
         assert (check.value, check.verdict) == ("not known", "FAIL")
 
+    def test_standard_deviations_that_are_not_known_name_their_option(self, tmp_path, results):
+        path = tmp_path / "limits.toml"
+        path.write_text("[calibration]\nsensitivity_std = 1\ntilt_std = 1\n")
+        plain = dataclasses.replace(results["calibration"], sensitivity_std=None, tilt_std=None)
+        checks = part_of("it", plain, read_limits(path)).checks
+        assert {check.value for check in checks} == {"not known (calibrate with --uncertainty)"}
+        assert not any(check.passed for check in checks)
+
     @pytest.mark.parametrize("kind", ["averages", "scene"])
     def test_results_without_flags_or_findings_are_not_judged_by_them(
         self, tmp_path, results, kind
@@ -377,7 +400,7 @@ class TestLimits:
         assert (check.value, check.verdict) == ("not known", "FAIL")
 
     @pytest.mark.parametrize(
-        ("limits", "value", "told", "words", "passed"),
+        ("limits", "value", "note", "words", "passed"),
         [
             (CameraLimits(dark_noise_e=1), 0.9, "below", "below 0.9", True),
             (CameraLimits(dark_noise_e=1), 1.1, "below", "below 1.1", False),
@@ -388,9 +411,9 @@ class TestLimits:
             (CameraLimits(dsnu_e=1), np.nan, "not measured", "not measured", False),
         ],
     )
-    def test_a_bound_passes_where_all_that_it_allows_does(self, limits, value, told, words, passed):
+    def test_a_bound_passes_where_all_that_it_allows_does(self, limits, value, note, words, passed):
         (name,) = limits.model_dump(exclude={"findings"}, exclude_none=True)
-        checks = checked(limits, {name: value}, (), {name: told})
+        checks = checked(limits, {name: value}, (), {name: note})
         (check,) = (each for each in checks if each.name == name)
         assert (check.value, check.passed) == (words, passed)
 
@@ -424,7 +447,7 @@ class TestCommand:
         out = tmp_path / "report.html"
         status, printed, _ = run("report", saved, "-o", out)
         assert status == 0
-        assert "not judged" in printed
+        assert "not judged (give --limits)" in printed
         text = out.read_text(encoding="utf-8")
         assert len(text) < 15e6
         assert re.search(r"<h3>Provenance</h3>", text)

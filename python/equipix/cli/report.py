@@ -38,9 +38,10 @@ def report(
     title = f"Report of {results[0].name}" if len(results) == 1 else f"{len(results)} results"
     write_page(output, page(parts, title), force=force)
     judged = {part.name: part.checks for part in parts}
+    unjudged = "not judged" if limits or as_json else "not judged (give --limits)"
     result: dict[str, Any] = {
         "output": str(output),
-        "verdicts": {part.name: part.verdict or "not judged" for part in parts},
+        "verdicts": {part.name: part.verdict or unjudged for part in parts},
     }
     if as_json:
         result["limits"] = {name: in_json(checks) for name, checks in judged.items()}

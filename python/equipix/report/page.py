@@ -144,6 +144,9 @@ def part_of(name: str, result: Any, limits: LimitsFile, *, share: int = 1) -> Pa
     judged = {"flagged_share": None} | figures
     if math.isnan(figures.get("reduced_chi2", figures.get("variance_of_a_value", 0.0))):
         judged["reduced_chi2"] = None  # no more values than unknowns
+    notes = {}
+    if isinstance(result, Calibration) and result.sensitivity_std is None:
+        notes = dict.fromkeys(("sensitivity_std", "tilt_std"), f"not known ({_why_none(result)})")
     maps = maps_of(result)
     curves = curves_of(result, maps[0])
     if flags is not None and flags.any():
@@ -152,7 +155,7 @@ def part_of(name: str, result: Any, limits: LimitsFile, *, share: int = 1) -> Pa
         name=name,
         what=repr(result).strip("<>"),
         findings=findings,
-        checks=checked(_limits_of(result, limits), judged, findings),
+        checks=checked(_limits_of(result, limits), judged, findings, notes),
         figures=words_of(figures),
         maps=[mapped(each, int(LARGEST / share**0.5)) for each in maps],
         plots=[*map(drawn, curves)],
@@ -330,26 +333,35 @@ def _shifts(calibration: Calibration) -> Table:
     return Table("Exposures", head, rows, "Shifts in pixels, with standard deviations if known.")
 
 
+def _why_none(calibration: Calibration) -> str:
+    """Say what gives a calibration the standard deviations that it lacks, or where to see why."""
+    failed = any(each.kind == "uncertainty" for each in calibration.findings)
+    return "see its findings" if failed else "calibrate with --uncertainty"
+
+
 def _errors(calibration: Calibration) -> Table:
-    """What the error of M is made of, as far as it is known; error bars contain the drift."""
+    """What the error of M is made of, known or not; error bars contain the drift."""
     std, tilt, drift = calibration.sensitivity_std, calibration.tilt_std, calibration.drift
-    rows = []
+    pixel = of_tilt = ("not known", _why_none(calibration))
+    lamp = ("not known", "in the tilt: the exposures do not determine it")
     if std is not None:
         variance = np.square(std, dtype=np.float64)
         if drift is not None:
             response = calibration.sensitivity
             variance -= response**2 * drift.variance_map(response)
         noise = np.sqrt(np.maximum(np.nanmedian(variance), 0))
-        rows.append(("Noise, of a pixel", f"{noise:.2g}", "median"))
+        pixel = (f"{noise:.2g}", "median")
     if tilt is not None:
         variance = np.square(tilt) - np.square(0.0 if drift is None else drift.tilt_std)
-        noise = np.sqrt(np.maximum(variance, 0))
-        rows.append(("Noise, of the tilt", _pair(noise), "edge to edge, along rows and columns"))
+        of_tilt = (_pair(np.sqrt(np.maximum(variance, 0))), "edge to edge, along rows and columns")
     if drift is not None:
-        what = f"in the tilt; the drift is {drift.size:.2g}"
-        rows.append(("Drift of the lamp", _pair(drift.tilt_std), what))
-    if not rows:
-        rows.append(("Noise", "not computed", "calibrate with --uncertainty"))
+        size = f"is {drift.size:.2g}" if drift.size else "is smaller than the noise of the fluxes"
+        lamp = (_pair(drift.tilt_std), f"in the tilt; the drift {size}")
+    rows = [
+        ("Noise, of a pixel", *pixel),
+        ("Noise, of the tilt", *of_tilt),
+        ("Drift of the lamp", *lamp),
+    ]
     solver = (
         f"The estimated error that the solver left, {calibration.error_estimate:.2g}, is no "
         "standard deviation."
