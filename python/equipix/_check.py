@@ -185,7 +185,7 @@ def as_shifts(shifts: ArrayLike) -> NDArray[np.float64]:
     if not np.isfinite(array).all():
         k = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
         raise InputError(
-            f"'shifts' of exposure {k} is {array[k].tolist()}, expected finite numbers"
+            f"'shifts' of exposure {k} (from 0) is {array[k].tolist()}, expected finite numbers"
         )
     return array
 

@@ -39,7 +39,7 @@ def test_equal_constants_are_named_and_missing_exposures_are_not():
 
 
 def test_a_calibration_of_equal_constant_frames_says_so():
-    with pytest.warns(errors.MisfitWarning, match="exposures 0 and 1 are equal, value for value"):
+    with pytest.warns(errors.MisfitWarning, match=r"exposure 0 \(from 0\) and exposure 1 \("):
         cal = equipix.calibrate(np.full((5, 24, 32), 1000.0), CROSS)
     assert "repeated" in {finding.kind for finding in cal.findings}
 
@@ -49,5 +49,7 @@ def test_a_calibration_says_so():
     frames[4] = frames[2]
     with pytest.warns(errors.EquipixWarning) as caught:
         cal = equipix.calibrate(frames, CROSS)
-    assert "exposures 2 and 4 are equal, value for value" in str(caught[0].message)
+    assert "exposure 2 (from 0) and exposure 4 (from 0) are equal, value for value" in str(
+        caught[0].message
+    )
     assert "repeated" in {finding.kind for finding in cal.findings}

@@ -226,10 +226,26 @@ def test_coordinate_descent_rounds_a_fraction_of_a_pixel_with_a_warning(edited):
     path = edited('aperture_before = "aperture/p1-before.tif"', "shift = [0.0, 5.3]")
     path.write_text(re.sub(r"aperture_after = .*p1-after.*\n", "", path.read_text()))
     with (
-        pytest.warns(errors.InputWarning, match=r"rounded to whole pixels"),
+        pytest.warns(errors.InputWarning, match="rounded to whole pixels: that of exposure 'p3'"),
         pytest.warns(errors.ConvergenceWarning),
     ):
         Experiment.load(path).run(method="coordinate-descent", max_sweeps=2)
+
+
+@pytest.mark.parametrize(
+    ("shift", "flux", "words"),
+    [
+        ("[100, 0]", "1", "'shifts' of exposure 'p1' is .* row part must be smaller"),
+        ("[0, 5]", "1e60", "'flux' of exposure 'p1' is 1.*expected a positive number"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning", "ignore:overflow")
+def test_errors_on_an_exposure_have_its_name(edited, manifest, shift, flux, words):
+    text = re.sub(r"aperture_\w+ = .*p1.*\n", "", manifest.read_text())
+    text = re.sub(r"(name = .*)", r"\1\nflux = 1", text).replace("flux = 1\n", "", 1)
+    text = text.replace('name = "p1"\nflux = 1', f'name = "p1"\nflux = {flux}\nshift = {shift}')
+    with pytest.raises(errors.InputError, match=words):
+        Experiment.load(edited(manifest.read_text(), text)).run(max_sweeps=2)
 
 
 def test_progress_names_the_stages(manifest):

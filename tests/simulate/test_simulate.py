@@ -123,7 +123,7 @@ class TestExposures:
             ({"shifts": [(0, 0, 0)]}, r"'shifts' has shape \(1, 3\)"),
             (
                 {"shifts": [(0, 0), (np.nan, 1)]},
-                r"'shifts' of exposure 1 is \[nan, 1.0\], expected finite",
+                r"'shifts' of exposure 1 \(from 0\) is \[nan, 1.0\], expected finite",
             ),
             ({"flux": [1.0, 2.0]}, "'flux' has 2 entries, expected 1"),
             ({"rotation": [45]}, "'rotation' holds 45"),

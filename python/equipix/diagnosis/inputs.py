@@ -57,8 +57,8 @@ def _on_repeats(exposures: Exposures) -> str | None:
         return None
     first, second = pair
     return (
-        f"exposures {first} and {second} are equal, value for value, which noise prevents: give "
-        "each position its own frames, and see whether the sensor moved"
+        f"{exposures.name_of(first)} and {exposures.name_of(second)} are equal, value for value, "
+        "which noise prevents: give each position its own frames, and see whether the sensor moved"
     )
 
 
@@ -67,7 +67,8 @@ def _on_rounding(exposures: Exposures) -> str | None:
     rounding = exposures.positions.rounding
     if rounding is None:
         return None
-    return f"{rounding.words}: use method='multiscale', or move the sensor by whole pixels"
+    words = rounding.words(exposures.names)
+    return f"{words}: use method='multiscale', or move the sensor by whole pixels"
 
 
 def _on_order(exposures: Exposures) -> str | None:

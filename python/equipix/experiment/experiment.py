@@ -18,7 +18,7 @@ from equipix.experiment.aperture import (
 from equipix.experiment.darks import Darks
 from equipix.experiment.described import Described
 from equipix.experiment.manifest import Manifest
-from equipix.exposures.exposures import Exposures, FitOptions
+from equipix.exposures.exposures import Exposures, FitOptions, naming_exposures
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Positions
 from equipix.findings import Finding, say
@@ -192,7 +192,8 @@ class Experiment(Described[Manifest]):
         moves = measured_moves(self.path, self.manifest, colours, hot=hot)
         shifts, std = moves.shifts, moves.std
         whole = fit_options.whole_shifts
-        with naming_memory("calibrating"):
+        names = [exposure.name for exposure in self.manifest.exposure]
+        with naming_memory("calibrating"), naming_exposures(names):
             measured = measured_of(averaged)
             positions = Positions.of(
                 shifts,
@@ -215,7 +216,7 @@ class Experiment(Described[Manifest]):
         origin = self._provenance(
             hashes,
             averaged,
-            exposures=[exposure.name for exposure in self.manifest.exposure],
+            exposures=names,
             darks=list(darks.words),
             measured_shifts=shifts.tolist(),
             measured_shift_std=std.tolist(),

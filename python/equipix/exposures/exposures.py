@@ -1,6 +1,9 @@
 """Exposures of one beam: how they are fitted, predicted, and parts of them."""
 
 import dataclasses
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Self, get_args
 
@@ -26,7 +29,7 @@ from equipix._check import (
 from equipix._native import Fit
 from equipix.errors import InputError
 from equipix.exposures.flux import Flux
-from equipix.exposures.positions import Positions, nearest_whole
+from equipix.exposures.positions import Positions, name_of, nearest_whole
 from equipix.measured.colour import Filters, mean_signal
 from equipix.measured.defects import BadPixels
 from equipix.measured.measured import Measured
@@ -87,6 +90,17 @@ class FitOptions:
         check_progress(progress)
         most = None if max_sweeps is None else positive_count("max_sweeps", max_sweeps)
         return cls(method, as_tolerance(tolerance), most, positive_workers(workers), progress)
+
+
+@contextmanager
+def naming_exposures(names: Sequence[str]) -> Iterator[None]:
+    """Name the exposure of an error that has its number alone, as those of the core."""
+    try:
+        yield
+    except InputError as error:
+        number = r"(?<=of )exposure (\d+)( \(from 0\))?"
+        words = re.sub(number, lambda it: name_of(names, int(it[1])), str(error))
+        raise type(error)(words) from error
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -157,8 +171,7 @@ class Exposures(Measured):
 
     def name_of(self, exposure: int) -> str:
         """Return how messages name an exposure."""
-        own = self.names[exposure] if self.names else ""
-        return f"exposure {own!r}" if own else f"exposure {exposure} (from 0)"
+        return name_of(self.names, exposure)
 
     def used(self, fit: Fit, exposure: int) -> Bools:
         """Return which measurements of an exposure a fit used: usable ones that it did not lose."""
@@ -261,7 +274,7 @@ class Exposures(Measured):
         InsufficientMemoryError
             If there is not enough memory.
         """
-        with naming_memory("calibrating"):
+        with naming_memory("calibrating"), naming_exposures(self.names):
             compiled = _native.Exposures(
                 self.values,
                 self.positions.shifts,

@@ -248,9 +248,9 @@ def _check_reach(shifts: Floats, rotation: Array, shape: tuple[int, ...]) -> Non
         for name, part, side in zip(("row", "column"), shift, window, strict=True):
             if abs(part) >= side:
                 raise InputError(
-                    f"'shifts' of exposure {k} is ({shift[0]:.10g}, {shift[1]:.10g}): its {name} "
-                    f"part must be smaller than the sensor, which has {side} there; micrometres "
-                    "become pixels when divided by the pixel pitch"
+                    f"'shifts' of exposure {k} (from 0) is ({shift[0]:.10g}, {shift[1]:.10g}): "
+                    f"its {name} part must be smaller than the sensor, which has {side} there; "
+                    "micrometres become pixels when divided by the pixel pitch"
                 )
 
 
@@ -272,6 +272,12 @@ def micrometre_step(shifts: Floats, shape: tuple[int, int]) -> float | None:
     return step if step >= least[0] and large > least[1] else None
 
 
+def name_of(names: Sequence[str], exposure: int) -> str:
+    """Return how messages name an exposure."""
+    own = names[exposure] if names else ""
+    return f"exposure {own!r}" if own else f"exposure {exposure} (from 0)"
+
+
 ROUNDING = 1e-6
 """Largest fraction of a pixel that counts as rounding, as in the core."""
 
@@ -285,11 +291,10 @@ class Rounding(NamedTuple):
     exposure: int
     shift: list[float]
 
-    @property
-    def words(self) -> str:
-        """What was rounded, and the limit."""
+    def words(self, names: Sequence[str] = ()) -> str:
+        """Say what was rounded, and the limit; exposures may have names."""
         return (
-            f"shifts are rounded to whole pixels: that of exposure {self.exposure} (from 0) is "
+            f"shifts are rounded to whole pixels: that of {name_of(names, self.exposure)} is "
             f"{np.round(self.shift, 3).tolist()} (limit {_UNNOTICED:g} from whole)"
         )
 

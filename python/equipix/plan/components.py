@@ -143,7 +143,9 @@ def identify(
     whole, rounding = whole_moves(exact), round_shifts(exact)[1]
     if rounding is not None:
         first = np.round(exact[0], 3).tolist()
-        words = f"{rounding.words}, the first is {first}: choose shifts that differ by whole pixels"
+        words = (
+            f"{rounding.words()}, the first is {first}: choose shifts that differ by whole pixels"
+        )
         say(Finding("rounding", words, "input"))
     masked = as_mask(mask, (len(whole), *sizes), may_be_whole=True)
     turns = as_rotation(rotation, len(whole)).tolist()
