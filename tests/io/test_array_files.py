@@ -125,6 +125,8 @@ def test_a_part_at_a_time(tmp_path, monkeypatch, write):
         (lambda folder: folder / named(folder, FRAMES).rsplit(":")[0], "name one, as in"),
         (lambda folder: npy(folder, np.zeros(3)), "expected numbers of shape"),
         (lambda folder: npy(folder, np.zeros((2, 3), "U1")), "expected numbers of shape"),
+        (lambda folder: npy(folder, np.zeros((8, 9, 3))), r"\(8, 9, 3\), as colour images are"),
+        (lambda folder: npy(folder, np.zeros((2, 8, 9, 4))), "one grey channel"),
         (lambda folder: npy(folder, FRAMES[:0]), r"of shape \(0, 8, 9\), expected .* 1 or more"),
         (lambda folder: hdf5(folder, FRAMES[:, :0]), r"of shape \(5, 0, 9\), expected"),
         (lambda folder: default(folder, "entry", str), "holds /entry/a, /entry/b: name one"),

@@ -31,6 +31,9 @@ _PLACE = re.compile(rf"(.*?(?:{'|'.join(map(re.escape, (*HDF5, *ZARR)))})):(.*)"
 
 _MOST_LISTED = 8
 
+_LEAST_SIDE = 8
+"""Fewest rows and columns of what is a colour image, where 3 or 4 values stand on the last axis."""
+
 
 def split(path: Path) -> tuple[Path, str]:
     """Return the file, and what stands behind its name: the place of an array in it, or a layout.
@@ -79,6 +82,12 @@ def _opened(path: Path) -> Iterator[Any]:
             raise FileError(
                 f"{path}: is {array.dtype} of shape {array.shape}, expected numbers of shape "
                 "(rows, cols) or (n, rows, cols), each 1 or more"
+            )
+        *_, rows, cols, last = (0, *array.shape)
+        if last in (3, 4) and min(rows, cols) >= _LEAST_SIDE:
+            raise FileError(
+                f"{path}: is {array.dtype} of shape {array.shape}, as colour images are, expected "
+                "one grey channel of shape (rows, cols) or (n, rows, cols): save one channel alone"
             )
         yield array
 
