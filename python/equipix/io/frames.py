@@ -164,6 +164,11 @@ def leaving_others(*paths: Path) -> Iterator[None]:
 
 def check_image(path: Path) -> None:
     """Refuse a file of unknown format, and an OME-TIFF whose pages are not frames of one thing."""
+    if suffix_of(path) in (".jpg", ".jpeg"):
+        raise FileError(
+            f"{path}: is a JPEG, whose values are not proportional to light and lose detail, "
+            "expected .tif, .png or a raw file: record one of these"
+        )
     if not has_format(path):
         raise FileError(
             f"{path}: has no suffix of a format that is read, expected "
