@@ -83,8 +83,8 @@ def _opened(path: Path) -> Iterator[Any]:
                 f"{path}: is {array.dtype} of shape {array.shape}, expected numbers of shape "
                 "(rows, cols) or (n, rows, cols), each 1 or more"
             )
-        *_, rows, cols, last = (0, *array.shape)
-        if last in (3, 4) and min(rows, cols) >= _LEAST_SIDE:
+        is_deep = array.ndim > 2 and min(array.shape[-3:-1]) >= _LEAST_SIDE
+        if is_deep and array.shape[-1] in (3, 4):
             raise FileError(
                 f"{path}: is {array.dtype} of shape {array.shape}, as colour images are, expected "
                 "one grey channel of shape (rows, cols) or (n, rows, cols): save one channel alone"
