@@ -86,6 +86,9 @@ class TestExperiment:
         for k in range(3):
             write_fits(tmp_path / f"p{k}/a.fits", 1.0, level=500 + k)
         assert run("init", "experiment", tmp_path)[0] == 0
+        text = (tmp_path / "experiment.toml").read_text()
+        assert '"hole/p1-before.fits"' in text
+        assert ".tif" not in text
         path = filled(tmp_path / "experiment.toml", bit_depth=16, shift="[0, 5]")
         found = Experiment.load(path).manifest
         assert [(each.frames, each.exposure_s, each.temperature_c) for each in found.dark] == [

@@ -66,6 +66,9 @@ def draft_manifest(kind: str, folder: Path, start: Path) -> Draft:
     sensor = {} if found.raw else {"bit_depth": BLANK}
     title = " ".join([*(each.message + "." for each in findings if each.kind == "images"), _TITLE])
     text = template(model, title, {"sensor": sensor, **values}) + _comments(unused)
+    suffixes = [PurePosixPath(name).suffix for name in (*found.files, *unused)]
+    if suffixes and ".tif" not in suffixes:  # examples are as the images that there are
+        text = text.replace('.tif"', f'{suffixes[0]}"')
     blanks = text.count(f' = "{BLANK}"')
     return Draft(text, findings, len(found.files), len(unused), blanks)
 
