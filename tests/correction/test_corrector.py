@@ -344,7 +344,7 @@ class TestRefusals:
             ({"bit_depth": 17}, "'bit_depth' is 17, expected 8 to 16"),
             ({"bit_depth": 7}, "'bit_depth' is 7, expected 8 to 16"),
             ({"dtype": "uint8", "bit_depth": 12}, "'bit_depth' is 12, expected 8 to 8"),
-            ({"dtype": "float32", "bit_depth": 12}, "None for float32: whole numbers need 'dtype'"),
+            ({"dtype": "float32", "bit_depth": 12}, "12, but float32 has none: leave it out"),
             ({"flagged": "bad"}, "'flagged' is 'bad'"),
             ({"workers": 0}, "'workers'"),
         ],

@@ -302,10 +302,12 @@ def largest_value(dtype: np.dtype[Any], bit_depth: int | None = None) -> float:
         return float(np.iinfo(dtype).max) if dtype.kind == "u" else 0.0
     bits = 8 * dtype.itemsize
     if dtype.kind != "u" or not is_whole(bit_depth, 8, bits):
-        wanted = f"8 to {bits}"
+        problem = f"expected 8 to {bits}"
         if dtype.kind != "u":
-            wanted = "None for float32: whole numbers need 'dtype' (--dtype) uint16 or uint8"
-        raise InputError(f"'bit_depth' is {bit_depth!r}, expected {wanted}")
+            problem = (
+                "but float32 has none: leave it out, or give 'dtype' (--dtype) uint16 or uint8"
+            )
+        raise InputError(f"'bit_depth' is {bit_depth!r}, {problem}")
     return float(2**bit_depth - 1)
 
 
