@@ -29,7 +29,7 @@ class TestJson:
         ("arguments", "status", "code", "words"),
         [
             (("inspect", "none.tif"), 1, "file", "none.tif: does not exist"),
-            (("average", "FRAMES", "-o", "OUT.png"), 1, "input", "ends in none of"),
+            (("average", "FRAMES", "-o", "OUT.png"), 1, "input", "ends in '.png', expected"),
             (
                 ("average", "FRAMES", "-o", "OUT.npz", "--reject", "-1"),
                 1,

@@ -13,6 +13,7 @@ import tomllib
 import warnings
 from enum import Flag
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -500,7 +501,7 @@ class TestCommand:
     @pytest.mark.parametrize(
         ("arguments", "words"),
         [
-            (("SAVED", "-o", "OUT.pdf"), "ends in none of .html"),
+            (("SAVED", "-o", "OUT.pdf"), "ends in '.pdf', expected the suffix .html"),
             (("SAVED", "-o", "OUT.html", "--check"), "--check needs --limits"),
             (("missing.tif", "-o", "OUT.html"), "missing.tif: does not exist"),
             (("SAVED", "SAVED", "-o", "OUT.html"), "is named twice: name each result once"),
@@ -652,7 +653,7 @@ class TestCamera:
         path = written_camera(tmp_path, count=6, spatial=0)
         status, _, told = run("emva", path, "-o", tmp_path / name, "--force")
         assert status == 1
-        assert "ends in none of .html" in told
+        assert f"ends in '{Path(name).suffix}', expected the suffix .html" in told
 
 
 @pytest.mark.parametrize("step", [0.25, 1.0, 3.0])

@@ -158,7 +158,8 @@ def check_output(
     if path is None:
         return
     if suffixes and path.suffix.lower() not in suffixes:
-        raise InputError(f"'{path}' ends in none of {', '.join(suffixes)}, which name the format")
+        wanted = ", ".join(suffixes)
+        raise InputError(f"'{path}' ends in '{path.suffix}', expected the suffix {wanted}")
     if path.exists() and path.is_dir() != folder:
         kind, wanted = ("file", "folder") if folder else ("folder", "file")
         raise FileError(f"'{path}' is a {kind}, expected the name of a {wanted}")

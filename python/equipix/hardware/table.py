@@ -410,7 +410,8 @@ def read_table(path: str | PathLike[str]) -> Table:
 def _suffix(path: Path) -> str:
     suffix = path.suffix.lower()
     if suffix not in _FORMATS:
-        raise InputError(f"'{path}' ends in none of {', '.join(SUFFIXES)}, which name the format")
+        wanted = ", ".join(SUFFIXES)
+        raise InputError(f"'{path}' ends in '{path.suffix}', expected the suffix {wanted}")
     return suffix
 
 
