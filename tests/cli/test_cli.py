@@ -779,7 +779,7 @@ class TestPlan:
         given = ("plan", "--shape", 64, 80, "--shifts", self.CROSS, "--exposures", 7)
         status, _, err = run(*given)
         assert status == 1
-        assert "'--exposures' is 7, but a pattern given by '--shifts' has its own: leave one" in err
+        assert "--exposures is 7, but a pattern given by --shifts has its own: leave one" in err
 
     @pytest.mark.parametrize("shifts", ["0,0 0,0 0,1", "0,0 0,5 0,7", "0,0 0,5.3 0,7.8"])
     def test_what_a_line_of_shifts_leaves_open_is_said(self, run, shifts):
@@ -813,9 +813,9 @@ class TestPlan:
         ("arguments", "words"),
         [
             (("--max-shift", 9, 9, "--noise", "nan"), "--noise is nan"),
-            ((), "give either '--shifts'"),
-            (("--shifts", CROSS, "--max-shift", 9, 9), "give either '--shifts'"),
-            (("--shifts", "0,0 5"), "'--shifts' is '0,0 5'"),
+            ((), "give either --shifts"),
+            (("--shifts", CROSS, "--max-shift", 9, 9), "give either --shifts"),
+            (("--shifts", "0,0 5"), "--shifts is '0,0 5'"),
             (("--shifts", CROSS, "-o", "plan.doc"), "plan.doc"),
         ],
     )

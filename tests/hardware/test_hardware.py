@@ -415,10 +415,10 @@ def test_gains_for_the_upload_of_a_camera(made, tmp_path, run):
         equipix.load(tmp_path / "gain.tif")
     other, level = tmp_path / "other.tif", tmp_path / "level.tif"
     for options, words in (
-        ((other, "--gain-bits", 16), "--gain-bits is 16, but '--preset upload' has 12: leave one"),
-        ((other, "--out-bits", 16), "--out-bits is 16, but '--preset upload' writes gains alone"),
+        ((other, "--gain-bits", 16), "--gain-bits is 16, but --preset upload has 12: leave one"),
+        ((other, "--out-bits", 16), "--out-bits is 16, but --preset upload writes gains alone"),
         ((other, "--frames", level), f"--frames is given, but '{other}' holds gains alone"),
-        ((tmp_path / "o.hex",), "o.hex' is no image, but '--preset upload' writes one: name a"),
+        ((tmp_path / "o.hex",), "o.hex' is no image, but --preset upload writes one: name a"),
     ):
         status, _, told = run(*command, *options)
         assert status == 1
@@ -611,7 +611,7 @@ def test_memories_of_a_binary_file_are_aligned(made, tmp_path, bits):
 
 
 def test_other_suffixes_are_refused(made, tmp_path):
-    with pytest.raises(errors.InputError, match=r"ends in none of \.bin, \.hex, \.h"):
+    with pytest.raises(errors.InputError, match=r"ends in '\.txt', expected .* \.bin, \.hex, \.h"):
         hardware.Table.of(made[1]).save(tmp_path / "table.txt")
     with pytest.raises(errors.FileError, match=r"none\.bin: does not exist"):
         equipix.load(tmp_path / "none.bin")

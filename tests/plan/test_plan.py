@@ -662,5 +662,5 @@ def test_a_shift_error_in_an_even_beam_is_named(run):
     )
     status, _, err = run(*arguments, "--shift-error", "0.1")
     assert status == 0
-    assert "'--shift-error' has no effect in an even beam: give '--beam-width'" in err
+    assert "--shift-error has no effect in an even beam: give --beam-width" in err
     assert "even beam" not in run(*arguments, "--shift-error", "0.1", "--beam-width", "100")[2]

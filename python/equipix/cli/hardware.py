@@ -111,13 +111,13 @@ def _preset(output: Path, given: dict[str, Any]) -> dict[str, Any]:
     """
     if output.suffix.lower() not in IMAGES:
         raise InputError(
-            f"'{output}' is no image, but '--preset upload' writes one: name a file that ends in "
+            f"'{output}' is no image, but --preset upload writes one: name a file that ends in "
             f"{' or '.join(IMAGES)}, or leave it out"
         )
     for name, value in given.items():
         if name != "linearise" and value != UPLOAD.get(name):
             own = f"has {UPLOAD[name]:g}" if name in UPLOAD else "writes gains alone"
-            raise InputError(f"'{name}' is {value!r}, but '--preset upload' {own}: leave one out")
+            raise InputError(f"'{name}' is {value!r}, but --preset upload {own}: leave one out")
     # Offsets are not written, so none is to be refused for its step.
     return UPLOAD | {"offset_bits": WIDEST}
 

@@ -59,7 +59,7 @@ def plan(
     said: Findings = ()
     more: list[ErrorBudget] = []
     if causes["shift_error"] and causes["beam_width"] is None:
-        words = "'--shift-error' has no effect in an even beam: give '--beam-width' for another"
+        words = "--shift-error has no effect in an even beam: give --beam-width for another"
         said = say(Finding("unused", words, "input", "note"))
     check_picture(output)
     terminal.check_output(output, force=force)
@@ -100,11 +100,11 @@ def _refuse_both(
     """Refuse options that ask for an evaluation and for a search, or for neither."""
     if (shifts is None) == (max_shift is None):
         raise InputError(
-            "give either '--shifts', to evaluate a pattern, or '--max-shift', to find patterns"
+            "give either --shifts, to evaluate a pattern, or --max-shift, to find patterns"
         )
     if shifts is not None and exposures is not None:
         raise InputError(
-            f"'--exposures' is {exposures}, but a pattern given by '--shifts' has its own: leave "
+            f"--exposures is {exposures}, but a pattern given by --shifts has its own: leave "
             "one out"
         )
 
@@ -142,7 +142,7 @@ def _pairs(text: str) -> list[list[float]]:
     except ValueError:
         pairs = []
     if not pairs or any(len(pair) != 2 for pair in pairs):
-        raise InputError(f"'--shifts' is {text!r}, expected pairs such as '0,0 0,11 0,19'")
+        raise InputError(f"--shifts is {text!r}, expected pairs such as '0,0 0,11 0,19'")
     return pairs
 
 
