@@ -35,10 +35,7 @@ _WORDS = Wording(
     mixed="give 'dark' (--dark) once for each {what}, with its own files",
     alike="name their frames in one, as a pattern in quotes",
     temperature="",
-    several=(
-        ", or 'dark' (--dark) several times: each frame takes the one that fits, or one "
-        "interpolated between two times"
-    ),
+    several=", or 'dark' (--dark) once for each {what}: each frame takes the one that fits",
 )
 
 _QUOTE = (
