@@ -73,8 +73,8 @@ def averaged(
 @terminal.options_of(
     correct_files,
     dark="'stored', which it is unless given, 'none', or dark frames or their average, a pattern "
-    "in quotes: --dark 'd*.fits'. Given once for each exposure time or temperature, each frame takes "
-    "the one that fits by its header, or one interpolated between two times.",
+    "in quotes: --dark 'd*.fits'. Given once for each exposure time or temperature, each frame "
+    "takes the one that fits by its header, or one interpolated between two times.",
     flagged="What flagged pixels become. Unless given, NaN in floating-point numbers; in whole "
     "numbers and pictures the mean of good neighbours.",
     dtype="Type of the result: whole numbers are rounded half to even, and values that had to be "
