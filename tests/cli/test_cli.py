@@ -136,14 +136,15 @@ def test_inspect_shows_the_calibration(run, calibration):
         r"shape +64 rows × 80 columns",
         r"converged +yes",
         r"flagged pixels +DO_NOT_USE 8",
-        r"\n +p0 .* 1 +\[dark\] *\n",
+        r"\ndark +\[dark\]\n",
+        r"\n +p0 .* 1 *\n",
     ):
         assert re.search(line, out)
     # The sign of the shifts is said once, in words that go with "findings none".
     assert re.search(r"findings +none", out)
     assert "shift sign" not in out
-    words = "the data do not determine .*, which is no fault; compare the axes of the stage once"
-    assert re.search(rf"orientation of the shifts +{words}", out)
+    words = "the data do not determine the orientation: the beam is smooth, which is no fault"
+    assert re.search(rf"orientation of the shifts +{words} \(see .*\)\n", out)
     _, out, _ = run("inspect", calibration, "--json")
     assert json.loads(out)["shift_sign"] == "undetermined"
     told, saved = json.loads(out), equipix.load(calibration)

@@ -81,13 +81,8 @@ def test_fringes_along_rows_determine_no_sign_along_columns(mirrored):
     frames = photograph(3, fringes(SENSOR))
     found = asked(frames, Orientation(cols=mirrored).shifts(CROSS.astype(float)))
     assert (found.rows, found.cols, found.sign) == ("confirmed", "undetermined", "undetermined")
-    assert (
-        "do not determine the orientation of the shifts (they do confirm the sign along rows"
-        in found.words
-    )
-    also = "the data fit equally well with the sign of the shifts along columns reversed, since"
-    assert also in found.words
-    assert "structure" in found.words
+    assert "do not determine the orientation (they do confirm the sign along rows" in found.words
+    assert "the beam is smooth, which is no fault" in found.words
 
 
 def test_rows_reversed_in_fringes_are_never_confirmed():

@@ -88,6 +88,9 @@ def show_result(result: dict[str, Any], found: Findings | None = None, *, as_jso
         return
     exposures = result.get("exposures", [])
     rows = words_of(result, without=("exposures",))
+    darks = {each["dark"] for each in exposures}
+    if len(darks) == 1 and darks != {None}:
+        rows.append(("dark", *darks))
     if len(exposures) > _MOST_EXPOSURES:
         rows.append(("exposures", f"{len(exposures)}: --json and equipix report list them"))
     width = max(len(name) for name, _ in rows)
@@ -104,7 +107,7 @@ def show_result(result: dict[str, Any], found: Findings | None = None, *, as_jso
             )
             for e in exposures
         ]
-        known = 4 if any(e["dark"] for e in exposures) else 3
+        known = 4 if len(darks) > 1 else 3
         show_table(titles[:known], [row[:known] for row in listed])
 
 
