@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import io
 import json
 import os
 import pty
@@ -640,6 +641,19 @@ def test_names_are_no_markup_of_tables(capsys):
     out = capsys.readouterr().out
     for words in ("a[b]", "[/c]", "p[red]0[/red]", "[/d] :smile:", "not determined"):
         assert words in out
+
+
+def test_the_bar_of_a_stage_that_ends_early_is_complete(monkeypatch):
+    """A solver may converge before the passes that it may take."""
+    screen = io.StringIO()
+    for name, value in {"TERM": "xterm", "COLUMNS": "100"}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(screen, "isatty", lambda: True)
+    monkeypatch.setattr(sys, "stderr", screen)
+    with terminal.progress_bars() as report:
+        report(56, 120, "calibrate")
+        report(0, 9, "uncertainty")
+    assert "56/56" in screen.getvalue()
 
 
 def test_a_terminal_sees_bars(experiment, tmp_path):

@@ -57,6 +57,8 @@ def progress_bars(*, announce: bool = False) -> Iterator[Progress | None]:
 
         def report(done: int, total: int, stage: str) -> None:
             if stage not in stages:
+                for each in bars.tasks:  # a solver that converged needs fewer passes than allowed
+                    bars.update(each.id, total=each.completed)
                 stages[stage] = bars.add_task(stage, total=total)
             bars.update(stages[stage], completed=done, total=total)
 
