@@ -94,6 +94,18 @@ class TestNotFinite:
             done = correct_files(response, holed, Path("out.tif"), **options)
         assert [each.kind for each in done.findings] == ["not_finite"]
 
+    @pytest.mark.parametrize(("flagged", "count"), [("nan", 2), ("keep", 1), ("replace", 0)])
+    def test_flagged_pixels_without_a_value_are_counted(self, tmp_path, flagged, count):
+        """Of those that are kept the ones without coefficients."""
+        planes, flags = np.zeros((2, *SHAPE)), np.zeros(SHAPE, np.uint32)
+        planes[1], planes[1, 3, 4] = 1, np.nan
+        flags[3, 4:6] = Flag.DEAD | Flag.DO_NOT_USE
+        raw = tmp_path / "raw.tif"
+        write_frames(raw, [frames(5)], nbytes=frames(5).nbytes)
+        correction = equipix.Polynomial(planes, flags)
+        done = correct_files(correction, [str(raw)], tmp_path / "out.tif", flagged=flagged)
+        assert done.flagged == np.isnan(read_frames(tmp_path / "out.tif")).sum() == count
+
     def test_good_frames_have_none(self, response, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         values = frames(5).astype(np.float32)

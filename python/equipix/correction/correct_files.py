@@ -51,7 +51,8 @@ class Corrected(NamedTuple):
     replaced : int
         Pixels that were replaced in each frame.
     flagged : int
-        Pixels flagged ``DO_NOT_USE`` that became NaN in each frame; black in pictures.
+        Pixels flagged ``DO_NOT_USE`` that became NaN in each frame: all, or of those that are kept
+        the ones without coefficients. They are 0 in whole numbers, and black in pictures.
     findings : tuple of Finding
         What limits the frames, each also a warning.
     """
@@ -169,7 +170,10 @@ def correct_files(
     said += _warn_of_not_finite(work.not_finite, np.dtype(np.uint8) if display else wanted)
     made = work.corrector
     said += _warn_of_limited(made.clipped, total * correction.flags.size, wanted)
-    counts = made.clipped, made.extrapolated, made.replaced, bad if flagged == "nan" else 0
+    if flagged != "nan":
+        kept = correction.coefficients[:, ~good] if flagged == "keep" else np.empty((1, 0))
+        bad = int(np.count_nonzero(~np.isfinite(kept).all(axis=0)))
+    counts = made.clipped, made.extrapolated, made.replaced, bad
     return Corrected(wanted.name, total, *counts, said)
 
 
