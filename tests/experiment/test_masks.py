@@ -8,6 +8,7 @@ import re
 import numpy as np
 import pytest
 import tifffile
+from astropy.io import fits
 
 import equipix
 from equipix import Experiment, Flag, cli, errors, simulate
@@ -50,6 +51,8 @@ def write_mask(path, mask):
         np.save(path, mask)
     elif path.suffix == ".tif":
         tifffile.imwrite(path, mask.astype(np.uint8) * 255, photometric="minisblack")
+    elif path.suffix == ".fits":
+        fits.writeto(path, mask.astype(np.uint8))
     else:
         header = f"P5\n{mask.shape[1]} {mask.shape[0]}\n255\n".encode()
         path.write_bytes(header + mask.astype(np.uint8).tobytes())
@@ -68,7 +71,7 @@ def mask():
     return mask
 
 
-@pytest.mark.parametrize("suffix", [".npy", ".tif", ".pgm"])
+@pytest.mark.parametrize("suffix", [".npy", ".tif", ".pgm", ".fits"])
 def test_a_mask_file_excludes_pixels(edited, tmp_path, mask, suffix):
     write_mask(tmp_path / f"mask{suffix}", mask)
     experiment = Experiment.load(edited(f'mask = "mask{suffix}"'))

@@ -274,7 +274,7 @@ Workers = Annotated[
 
 Mask = Annotated[
     Path | None,
-    typer.Option(help="An image or .npy file: pixels that are not 0 in it are left out."),
+    typer.Option(help="An image, FITS or .npy file: pixels that are not 0 in it are left out."),
 ]
 
 Cfa = Annotated[

@@ -182,7 +182,9 @@ class Sensor(Table):
         0.5,
     )
     mask: Text | None = key(
-        "an image (TIFF, PNG, PGM, BMP) or .npy", "pixels not 0 in it are not used", "mask.png"
+        "an image (TIFF, PNG, PGM, BMP, FITS) or .npy",
+        "pixels not 0 in it are not used",
+        "mask.png",
     )
     region: Annotated[list[Region], Field(min_length=1)] | None = key(
         "tables [[sensor.region]]", "areas that are not used, each a rectangle or a circle"

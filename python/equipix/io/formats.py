@@ -307,7 +307,7 @@ def read_mask(path: str | PathLike[str]) -> Bools:
     Parameters
     ----------
     path : path
-        One grey image (TIFF, PNG, PGM or BMP), or a NumPy array (.npy) of two dimensions.
+        One grey image (TIFF, PNG, PGM, BMP or FITS), or a NumPy array (.npy) of two dimensions.
 
     Returns
     -------
