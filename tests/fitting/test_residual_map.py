@@ -8,6 +8,7 @@ import pytest
 import equipix
 from equipix import simulate
 from equipix.errors import MisfitWarning
+from equipix.report.maps import maps_of
 
 STD = 1e-3
 
@@ -33,6 +34,8 @@ def test_it_is_the_rms_over_exposures(shape, side):
     residuals = residuals.reshape(5, shape[0] // side, -1, side)
     assert cal.residual_map.shape == (shape[0] // side, shape[1] // side)
     assert cal.residual_map.dtype == np.float32
+    (name,) = (each.name for each in maps_of(cal) if each.name.startswith("Residuals, rms"))
+    assert ("of a row of each cell" in name) is (side > 1)
     known = np.isfinite(cal.residual_map)
     # The first rows are masked, and in no use.
     np.testing.assert_array_equal(known, (np.indices(known.shape)[0] * side + side // 2) >= 3)

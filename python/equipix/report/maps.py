@@ -128,7 +128,8 @@ def _of_calibration(calibration: Calibration) -> Iterator[Map]:
     if residuals is not None:
         unit = "DN" if calibration.metadata["options"]["weights"] == "equal" else "σ"
         cell = cell_side(calibration.shape, len(calibration.shifts))
-        yield Map("Residuals, rms", unit, residuals, "size", cell)
+        name = "Residuals, rms" + (" of a row of each cell" if cell > 1 else "")
+        yield Map(name, unit, residuals, "size", cell)
     over = "" if calibration.cfa is None else ", over the response of each colour"
     yield Map(f"Beam L{over}", "DN", calibration.beam)
     if calibration.dark is not None:
