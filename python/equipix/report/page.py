@@ -311,26 +311,31 @@ def _tables(result: Any) -> Iterator[Table]:
 
 
 def _shifts(calibration: Calibration) -> Table:
-    """Where the sensor stood: measured, and as fitted with its standard deviation."""
+    """Where the sensor stood, as given or measured and as fitted, and the dark that was taken."""
     metadata = calibration.metadata
     count = len(calibration.shifts)
     names = metadata.get("exposures", [str(number) for number in range(count)])
     measured, stated = (
         metadata.get(name, [None] * count) for name in ("measured_shifts", "measured_shift_std")
     )
-    std = calibration.shift_std
-    rows = [
+    std, darks = calibration.shift_std, metadata.get("darks", [""] * count)
+    rows: list[tuple[str, ...]] = [
         (
             str(names[k]),
             "given" if measured[k] is None else pair_in_words(measured[k], stated[k]),
             pair_in_words(calibration.shifts[k], None if std is None else std[k]),
             f"{calibration.rotation[k]}°",
             f"{calibration.flux[k]:.5g}",
+            darks[k] or "not known",
         )
         for k in range(count)
     ]
-    head = ("Exposure", "Measured (row, col)", "Used (row, col)", "Turned", "Flux")
-    return Table("Exposures", head, rows, "Shifts in pixels, with standard deviations if known.")
+    head = ("Exposure", "Given or measured (row, col)", "Used (row, col)", "Turned", "Flux", "Dark")
+    known = 6 if any(darks) else 5
+    rows = [row[:known] for row in rows]
+    return Table(
+        "Exposures", head[:known], rows, "Shifts in pixels, with standard deviations if known."
+    )
 
 
 def _why_none(calibration: Calibration) -> str:
