@@ -245,10 +245,16 @@ def test_dead_and_hot_pixels_are_listed_before_those_of_a_mask(results):
 def test_shifts_and_fluxes_are_listed(results):
     cal = results["calibration"]
     table = part_of("it", cal, NOTHING).tables[0]
-    assert table.head == ("Exposure", "Measured (row, col)", "Used (row, col)", "Turned", "Flux")
+    assert table.head == (
+        *("Exposure", "Given or measured (row, col)", "Used (row, col)", "Turned", "Flux"),
+    )
     assert [row[0] for row in table.rows] == ["0", "1", "2", "3", "4"]
     row, col = cal.shifts[1]
     assert table.rows[1] == ("1", "given", f"{row:.4f}, {col:.4f}", "0°", "1")
+    darks = ["[[dark]] 1", *4 * ["[[dark]] 2"]]
+    dark = dataclasses.replace(cal, metadata=cal.metadata | {"darks": darks})
+    table = part_of("it", dark, NOTHING).tables[0]
+    assert [table.head[-1], *(row[-1] for row in table.rows)] == ["Dark", *darks]
 
 
 def test_colours_are_said_of_response_and_beam():
@@ -303,6 +309,10 @@ def test_curves_have_names_units_and_signs(results):
     draw_histogram(axes[4], Map("It", "", np.array([[1.0, 2.0, 2.0, np.nan]])))
     assert axes[4].patches[0].get_data().values.sum() == 3
     assert axes[4].get_xlabel().startswith("relative;")
+    wide = new_figure(5.2, 3.8).subplots()
+    draw_histogram(wide, Map("M", "", np.linspace(0.8966, 1.088, 99)[None]))
+    # Seven numbers of three decimals fit below the histogram of a page.
+    assert np.sum(abs(wide.get_xticks() - 0.9923) < 0.1) <= 7
     assert limits_of(Map("it", "", values, "deviation"), np.array([-1.0, 3.0])) == (
         pytest.approx(-3, rel=1e-2),
         pytest.approx(3, rel=1e-2),

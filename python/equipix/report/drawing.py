@@ -190,6 +190,7 @@ def draw_histogram(axes: Axes, shown: Map) -> None:
         yscale="log",
         ylim=(0.5, 2 * counts.max()),
     )
+    axes.locator_params("x", nbins=6)  # numbers of three decimals would touch
 
 
 def _step(shown: Map) -> float:
