@@ -22,9 +22,9 @@ def test_counts_come_back_with_pattern_and_levels(tmp_path, pattern):
     path = write_dng(tmp_path / "a.dng", COUNTS, pattern=pattern, black=(64, 65, 66, 67))
     np.testing.assert_array_equal(read_frames(path), COUNTS[None])
     assert frame_format(path) == ((1, *COUNTS.shape), np.dtype(np.uint16))
-    told = camera_raw.told(path)
-    assert told == (((64, 65), (66, 67)), 4095, [pattern[:2], pattern[2:]])
-    dark = told.dark((3, 3))
+    found = camera_raw.sensor_data(path)
+    assert found == (((64, 65), (66, 67)), 4095, [pattern[:2], pattern[2:]])
+    dark = found.dark((3, 3))
     np.testing.assert_array_equal(dark, [[64, 65, 64], [66, 67, 66], [64, 65, 64]])
 
 
@@ -36,7 +36,7 @@ def test_the_dark_border_is_left_out(tmp_path):
         rows, cols = raw.sizes.height, raw.sizes.width
     assert (rows, cols) >= (96, 116)
     np.testing.assert_array_equal(read_frames(path)[0], COUNTS[2:, 4:][:rows, :cols])
-    assert camera_raw.told(path).black == ((64, 65), (66, 67))
+    assert camera_raw.sensor_data(path).black == ((64, 65), (66, 67))
 
 
 def test_averages_are_those_of_the_counts(tmp_path):

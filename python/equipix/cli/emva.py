@@ -9,7 +9,7 @@ from equipix.cli import terminal
 from equipix.experiment.camera import CameraExperiment
 from equipix.io.paths import refuse_inputs
 from equipix.report.camera import bounds_of, camera_checks, camera_parts, figures_of, rows_of
-from equipix.report.figures import told
+from equipix.report.figures import findings_entry
 from equipix.report.limits import in_json, read_limits, refuse_beyond
 from equipix.report.page import page, write_page
 
@@ -47,7 +47,7 @@ def emva(
         of_planes = {
             name: {each.key: each.value for each in figures_of(found)}
             | {"bounds": bounds_of(found)}
-            | told(found.findings)
+            | findings_entry(found.findings)
             | ({} if limits is None else {"limits": in_json(checks)})
             for (name, found), checks in zip(planes.items(), judged.values(), strict=True)
         }

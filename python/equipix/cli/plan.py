@@ -18,7 +18,7 @@ from equipix.plan.budget import ErrorBudget, error_budget
 from equipix.plan.components import identify
 from equipix.plan.drift import advise_order, distinct_trend
 from equipix.plan.search import suggest
-from equipix.report.figures import told
+from equipix.report.figures import findings_entry
 
 commands = typer.Typer()
 
@@ -169,7 +169,7 @@ def _plan_summary(budget: ErrorBudget, cfa: str | None) -> dict[str, Any]:
         "distinct_trend": budget.distinct_trend,
         "order": order.tolist(),
         "distinct_trend_in_order": distinct_trend(budget.shifts[order]),
-        **told(budget.findings),
+        **findings_entry(budget.findings),
     }
 
 

@@ -26,7 +26,7 @@ from equipix.io.paths import find_files, refuse_inputs
 from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.response import Response
 from equipix.report import limits
-from equipix.report.figures import pair_in_words, summary, told, words_of
+from equipix.report.figures import findings_entry, pair_in_words, summary, words_of
 
 _Saved = Calibration | FrameStatistics | Polynomial | Response
 
@@ -82,9 +82,9 @@ def show_result(result: dict[str, Any], found: Findings | None = None, *, as_jso
 
     The object has a list of findings in any case.
     """
-    result = result if found is None else result | told(found, as_json=as_json)
+    result = result if found is None else result | findings_entry(found, as_json=as_json)
     if as_json:
-        result = result if "findings" in result else result | told(())
+        result = result if "findings" in result else result | findings_entry(())
         # JSON has no NaN and no infinity: null is what is not determined.
         print(json.dumps(json.loads(json.dumps(result), parse_constant=lambda _: None)))  # noqa: T201
         return
@@ -228,15 +228,15 @@ def options_of(
     for call in calls:
         known |= inspect.signature(call, eval_str=True).parameters
 
-    def option(name: str, told: str | OptionInfo) -> inspect.Parameter:
+    def option(name: str, asked: str | OptionInfo) -> inspect.Parameter:
         keyword = known[name.removesuffix(suffix)]
         kind, default = keyword.annotation, keyword.default
         if len(calls) > 1:
             kind, default = kind | None, None
-        if isinstance(told, str):
-            told = typer.Option(*([f"--{name}"] if kind is bool else []), help=told)
+        if isinstance(asked, str):
+            asked = typer.Option(*([f"--{name}"] if kind is bool else []), help=asked)
         return keyword.replace(
-            name=name, kind=keyword.KEYWORD_ONLY, default=default, annotation=Annotated[kind, told]
+            name=name, kind=keyword.KEYWORD_ONLY, default=default, annotation=Annotated[kind, asked]
         )
 
     def declared(command: Callable[..., None]) -> Callable[..., None]:

@@ -69,18 +69,20 @@ def completed(path: Path, manifest: _Manifest) -> _Manifest:
         If these contradict it or one another, or there is neither a dark nor a black level.
     """
     sensor, files = manifest.sensor, image_files(path, manifest)
-    told = {file: _told(file) for file in files if file.suffix.lower() in camera_raw.SUFFIXES}
+    held = {
+        file: _sensor_data(file) for file in files if file.suffix.lower() in camera_raw.SUFFIXES
+    }
     needs_black = isinstance(manifest, Manifest) and manifest.dark is None
-    if needs_black and len(told) < len(files):
+    if needs_black and len(held) < len(files):
         raise FileError(f"{path}: key 'dark' is missing")
     own: dict[str, object] = {}
     if sensor.saturation_level is None and manifest.layout is not None:
         own["bit_depth"] = binary.FORMATS[manifest.layout.pixel]
-    elif sensor.saturation is None and told:
-        white = min(each.white for each in told.values())
+    elif sensor.saturation is None and held:
+        white = min(each.white for each in held.values())
         own["saturation"] = float(min(white, sensor.largest or white))
     given, whence = Colours.of(sensor.cfa), "'cfa' in [sensor]"
-    for file, each in told.items():
+    for file, each in held.items():
         found = Colours.of(each.cfa)
         if given is None and found is not None:
             given, whence, own["cfa"] = found, f"'{file.name}'", str(found)
@@ -89,7 +91,7 @@ def completed(path: Path, manifest: _Manifest) -> _Manifest:
                 f"{path}: {whence} holds the colours '{given}', but '{file.name}' '{found}': "
                 "correct 'cfa' in [sensor], or name the files of one sensor"
             )
-        if needs_black and each.black != told[files[0]].black:
+        if needs_black and each.black != held[files[0]].black:
             raise FileError(
                 f"{path}: the black levels of '{files[0].name}' and '{file.name}' differ: give "
                 "[dark] with dark frames"
@@ -100,15 +102,15 @@ def completed(path: Path, manifest: _Manifest) -> _Manifest:
 def black_level(file: Path) -> tuple[str, Array]:
     """Black level, in DN, that a raw file holds: in words, and of each pixel."""
     _, rows, cols = frame_format(file)[0]
-    told = _told(file)
-    levels = [f"{level:g}" for row in told.black for level in row]
+    held = _sensor_data(file)
+    levels = [f"{level:g}" for row in held.black for level in row]
     words = levels[0] if len({*levels}) == 1 else ", ".join(levels)
-    return words, told.dark((rows, cols))
+    return words, held.dark((rows, cols))
 
 
-def _told(file: Path) -> camera_raw.Told:
+def _sensor_data(file: Path) -> camera_raw.SensorData:
     with reading(file):
-        return camera_raw.told(file)
+        return camera_raw.sensor_data(file)
 
 
 class Entry(NamedTuple):

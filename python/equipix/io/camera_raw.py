@@ -16,7 +16,7 @@ from equipix.errors import EquipixError, FileError
 SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2", ".pef")
 
 
-class Told(NamedTuple):
+class SensorData(NamedTuple):
     """What a raw file holds about its sensor.
 
     Attributes
@@ -57,12 +57,12 @@ def stream_frames(path: Path) -> Iterator[NDArray[Any]]:
         yield raw.raw_image_visible[None].copy()
 
 
-def told(path: Path) -> Told:
+def sensor_data(path: Path) -> SensorData:
     """Read black level, saturation and colour pattern."""
     with _opened(path) as raw:
         pattern = np.zeros((1, 1), int) if raw.raw_pattern is None else raw.raw_pattern
         black, names = raw.black_level_per_channel, raw.color_desc.decode()
-        return Told(
+        return SensorData(
             tuple(tuple(float(black[each]) for each in row) for row in pattern),
             int(raw.white_level),
             None

@@ -193,15 +193,15 @@ class _Arrays:
         shape = [*array.shape]
         return {"dtype": array.dtype.name, "shape": shape, "crc32": _checksum(array)}
 
-    def take(self, name: str, told: dict[str, Any], dtypes: str, axes: str) -> Array:
-        """Give back the array in whose place `told` stands."""
+    def take(self, name: str, entry: dict[str, Any], dtypes: str, axes: str) -> Array:
+        """Give back the array in whose place `entry` stands."""
         if name not in self.by_name:
             raise ValueError(f"array '{name}' is missing")
-        array = self.by_name.pop(name).reshape(told["shape"])
-        if told["dtype"] == "bool" and array.dtype == np.uint8:
+        array = self.by_name.pop(name).reshape(entry["shape"])
+        if entry["dtype"] == "bool" and array.dtype == np.uint8:
             array = array.astype(np.bool_)
         self._check(name, array, dtypes, axes)
-        if (array.dtype.name, _checksum(array)) != (told["dtype"], told["crc32"]):
+        if (array.dtype.name, _checksum(array)) != (entry["dtype"], entry["crc32"]):
             raise ValueError(f"array '{name}' differs from its checksum")
         return array
 
@@ -251,34 +251,34 @@ def _encoded(value: Any, hint: Any, name: str, held: _Arrays) -> Any:
     return str(plain) if inner is float and not math.isfinite(plain) else plain
 
 
-def _decoded(told: Any, hint: Any, name: str, held: _Arrays) -> Any:
+def _decoded(entry: Any, hint: Any, name: str, held: _Arrays) -> Any:
     """Return the value of a field from its JSON value and the arrays that `held` has."""
     inner = _without_none(hint)
-    if told is None and inner is not hint:
+    if entry is None and inner is not hint:
         return None
     if typing.get_origin(inner) is Annotated:
-        return held.take(name, told, *inner.__metadata__)
+        return held.take(name, entry, *inner.__metadata__)
     if fields := _fields(inner):
-        if told.keys() != fields.keys():
-            raise ValueError(f"'{name}' holds {', '.join(told)}, expected {', '.join(fields)}")
-        return inner(**_each(_decoded, told, fields, name, held))
+        if entry.keys() != fields.keys():
+            raise ValueError(f"'{name}' holds {', '.join(entry)}, expected {', '.join(fields)}")
+        return inner(**_each(_decoded, entry, fields, name, held))
     if typing.get_origin(inner) is dict:
-        hints = dict.fromkeys(told, typing.get_args(inner)[1])
-        return _each(_decoded, told, hints, name, held)
+        hints = dict.fromkeys(entry, typing.get_args(inner)[1])
+        return _each(_decoded, entry, hints, name, held)
     if typing.get_origin(inner) is tuple:
-        return tuple(_decoded(it, each, key, held) for it, each, key in _items(told, inner, name))
-    if inner is float and told in _NOT_FINITE:
-        return float(told)
-    _check_plain(told, inner, name)
-    return told
+        return tuple(_decoded(it, each, key, held) for it, each, key in _items(entry, inner, name))
+    if inner is float and entry in _NOT_FINITE:
+        return float(entry)
+    _check_plain(entry, inner, name)
+    return entry
 
 
 def _each(
-    code: Callable[..., Any], told: dict[str, Any], hints: dict[str, Any], name: str, held: _Arrays
+    code: Callable[..., Any], entry: dict[str, Any], hints: dict[str, Any], name: str, held: _Arrays
 ) -> dict[str, Any]:
     """Encode or decode the named values of a field by their annotations."""
     names = {key: f"{name}.{key}" if name else key for key in hints}
-    return {key: code(told[key], hint, names[key], held) for key, hint in hints.items()}
+    return {key: code(entry[key], hint, names[key], held) for key, hint in hints.items()}
 
 
 @cache

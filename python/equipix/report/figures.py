@@ -40,7 +40,7 @@ def known(**figures: Any) -> dict[str, Any]:
     return {name: value for name, value in figures.items() if value not in (None, "")}
 
 
-def told(findings: Findings, *, as_json: bool = True) -> dict[str, Any]:
+def findings_entry(findings: Findings, *, as_json: bool = True) -> dict[str, Any]:
     """Findings; their kinds alone where messages are on stderr, as warnings, already."""
     return {"findings": [asdict(each) if as_json else each.kind for each in findings]}
 
@@ -56,7 +56,7 @@ def _of_correction(correction: Correction) -> dict[str, Any]:
         **{name: correction.metadata[name] for name in _LAW if name in correction.metadata},
         **{f"scene_{name}": learned[name] for name in _LEARNED if name in learned},
         "flagged_pixels": flagged(correction),
-        **told(correction.findings),
+        **findings_entry(correction.findings),
     }
 
 
@@ -77,7 +77,7 @@ def of_table(table: Table) -> dict[str, Any]:
         "rounding_dn": (2.0**f.out + 2.0 ** (f.adc + f.gain) * int(table.gain.max())) / 2,
         **({"sag_dn": linearised["sag_dn"]} if linearised else {}),
         **known(correction_sha256=table.metadata.get("sha256")),
-        **told(table.findings),
+        **findings_entry(table.findings),
     }
 
 
@@ -101,7 +101,7 @@ def of_response(response: Response) -> dict[str, Any]:
         "largest_inverse_error": response.largest_inverse_error,
         **known(prediction_errors=options.get("prediction_errors")),
         "flagged_pixels": flagged(response),
-        **told(response.findings),
+        **findings_entry(response.findings),
     }
 
 
@@ -143,7 +143,7 @@ def of_dynamic(correction: DynamicCorrection) -> dict[str, Any]:
         **_errors("offset_prediction_errors", correction.metadata.get("prediction_errors")),
         **_gain(correction),
         "flagged_pixels": flagged(correction),
-        **told(correction.findings),
+        **findings_entry(correction.findings),
     }
 
 
@@ -187,7 +187,7 @@ def of_statistics(frames: FrameStatistics) -> dict[str, Any]:
         "saturated_pixels": int(np.count_nonzero(frames.saturated)),
         **known(rejected_beyond_sigmas=frames.reject),
         "dark_frames": 0 if frames.dark is None else int(frames.dark.count.max()),
-        **told(frames.findings),
+        **findings_entry(frames.findings),
     }
 
 
@@ -221,7 +221,7 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
         **_rejected(calibration),
         "is_partial": calibration.is_partial,
         "exposures": [*_exposures(calibration)],
-        **told(calibration.findings),
+        **findings_entry(calibration.findings),
     }
 
 

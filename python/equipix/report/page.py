@@ -201,7 +201,7 @@ def comparison_parts(
         maps = [*difference_maps("Difference", comparison.difference(number)), scatter]
         curves = (draw_histogram, draw_spectrum, draw_profiles)
         findings = tuple(dict.fromkeys(calibrations[i].findings + calibrations[j].findings))
-        told = [(str(files[k]), repr(calibrations[k]).strip("<>")) for k in (i, j)]
+        origins = [(str(files[k]), repr(calibrations[k]).strip("<>")) for k in (i, j)]
         parts.append(
             Part(
                 name=name,
@@ -212,7 +212,7 @@ def comparison_parts(
                 maps=[mapped(each, largest) for each in maps],
                 plots=[drawn(partial(draw, shown=maps[0])) for draw in curves],
                 tables=[Table("Differences", COMPARED, rows_of(comparison, number))],
-                provenance=told + [(f"sha256 of {files[k]}", hashes[files[k]]) for k in (i, j)],
+                provenance=origins + [(f"sha256 of {files[k]}", hashes[files[k]]) for k in (i, j)],
             )
         )
     return parts
