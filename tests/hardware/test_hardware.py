@@ -411,6 +411,13 @@ def test_gains_for_the_upload_of_a_camera(made, tmp_path, run):
     told = json.loads(run(*command, tmp_path / "again.tif", "--json")[1])
     assert (told["bits"], told["steps"]) == ({"gain": 12}, {"gain": 2.0**-10})
     assert told.keys().isdisjoint({"base", "zero", "largest_error_dn", "rounding_dn"})
+    lost = np.std(response.coefficients[0][used])
+    said = told["findings"][-1]["message"]
+    assert f"the offsets of the correction differ by {lost:.3g} DN" in said
+    # Gains without offsets lose nothing.
+    flat = tmp_path / "flat.npz"
+    polynomial(0.0, np.linspace(0.9, 1.1, 5)).save(flat)
+    assert run("hardware", flat, "--preset", "upload", "-o", tmp_path / "flat.tif")[1].count("none")
     with pytest.raises(errors.FileError, match="or wrote it for other programs alone, as gains"):
         equipix.load(tmp_path / "gain.tif")
     other, level = tmp_path / "other.tif", tmp_path / "level.tif"

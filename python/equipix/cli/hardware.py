@@ -10,7 +10,7 @@ from equipix._check import naming_memory
 from equipix.cli import terminal
 from equipix.correction.protocol import Correction, check_sensor
 from equipix.errors import InputError
-from equipix.findings import Findings
+from equipix.findings import Finding, Findings, say, usable
 from equipix.hardware.quality import Cost, Trial, trial, widths_of
 from equipix.hardware.table import IMAGES, SUFFIXES, UPLOAD, Table
 from equipix.hardware.words import WIDEST
@@ -87,12 +87,27 @@ def hardware(
     check_sensor(correction, sensor)
     table = Table.of(correction, **options)
     cost, said = _cost(result, correction, frames, options) if frames else ({}, ())
+    if gains_alone:
+        said = say(*_lost_offsets(correction, table))
     table.save(output, force=force)
     figures = {"output": str(output), **summary(table), **cost}
     if gains_alone:
         figures = {name: figures[name] for name in _OF_GAINS}
         figures |= {name: {"gain": figures[name]["gain"]} for name in ("bits", "steps")}
     terminal.show_result(figures, table.findings + said, as_json=as_json)
+
+
+def _lost_offsets(correction: Correction, table: Table) -> Findings:
+    """Say how much the offsets differ that a file of gains alone does not hold."""
+    lost = float(np.std(correction.coefficients[0][usable(table.flags)]))
+    if lost < 2.0**table.format.adc / 2:
+        return ()
+    words = (
+        f"the file holds gains alone, and the offsets of the correction differ by {lost:.3g} DN "
+        "(standard deviation), which stay in frames that the gains multiply: let the camera "
+        f"subtract its own offsets or dark first, or write {', '.join(SUFFIXES)}"
+    )
+    return (Finding("offsets", words, "input"),)
 
 
 def _is_given(context: typer.Context, name: str) -> bool:
