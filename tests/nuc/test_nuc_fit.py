@@ -473,6 +473,15 @@ class TestBadPixels:
         assert response.limits[1, 3, 4] == response.levels[6]
         assert response.saturation == 4095
 
+    def test_a_pixel_that_saturates_at_each_level_is_hot(self, levels):
+        levels[:, 3, 4] = 4095
+        response = nuc.fit(levels, order=1, saturation=4095)
+        stuck = Flag.HOT | Flag.DO_NOT_USE | Flag.SATURATED | Flag.NO_FLAT_FIELD
+        assert response.flags[3, 4] == stuck
+        # Neighbours that are as near to saturation do not show that it is stuck.
+        response = nuc.fit(levels[6:], order=1, saturation=4095)
+        assert response.flags[3, 4] == stuck & ~Flag.HOT
+
     def test_masked_pixels_are_undetermined(self, levels):
         mask = np.zeros(SHAPE, bool)
         mask[:, :5] = True

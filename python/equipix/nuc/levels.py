@@ -13,10 +13,10 @@ from equipix._check import Array, Bools, By, Floats, Ints, Words, as_mask, union
 from equipix.errors import InputError
 from equipix.findings import Finding, Rule, ask, say
 from equipix.measured.colour import Colours, Filters, mean_rise
-from equipix.measured.defects import SIGMAS, BadPixels, response_outliers
+from equipix.measured.defects import DEAD_RESPONSE, SIGMAS, BadPixels, response_outliers
 from equipix.measured.means import Averaged
 from equipix.measured.measured import Measured, averaged_of, check_levels, measured_of
-from equipix.measured.noise import MEDIAN_SQUARE, NoiseModel
+from equipix.measured.noise import MEDIAN_SQUARE, NoiseModel, block_medians, of_blocks
 from equipix.measured.part import ENOUGH, chosen, known_part, median, spread
 from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.level_rules import GIVEN, Given
@@ -189,7 +189,8 @@ def levels_of(
     excluded = given if averaged is not None else union(given, measured.mask)
     values = measured.values if excluded is None else np.where(excluded, np.nan, measured.values)
     filters = _filters(values, measured.colours)
-    bad_pixels = _with_odd_responses(values, noise, measured.bad_pixels, filters)
+    bad_pixels = _with_stuck(values, measured.bad_pixels, given)
+    bad_pixels = _with_odd_responses(values, noise, bad_pixels, filters)
     good = _good(values, bad_pixels, given)
     references = _references(values, good)
     own = {
@@ -258,6 +259,24 @@ def _level_noise(model: NoiseModel, values: Array, pedestal: float) -> LevelNois
     slope = model.gain / model.frames
     common = float(model.rounding(signal)) - model.rounding_apart(signal, values)
     return LevelNoise(float(model.variance(signal)) - common - slope * signal, slope, pedestal)
+
+
+def _with_stuck(values: Array, bad_pixels: BadPixels, mask: Bools | None) -> BadPixels:
+    """Add pixels that saturate at each level, also where their neighbours are far below.
+
+    At the lowest level the neighbours have less than half of what the array has at the highest.
+    """
+    if bad_pixels.saturated is None or not all(np.isfinite(each).any() for each in values):
+        return bad_pixels
+    stuck = bad_pixels.saturated & np.isnan(values).all(axis=0)
+    if mask is not None:
+        stuck &= ~mask.reshape(-1, *stuck.shape).any(axis=0)
+    if not stuck.any():
+        return bad_pixels
+    means = [median(each) for each in values]
+    around = of_blocks(block_medians(values[int(np.argmin(means))]), stuck.shape)
+    stuck &= around < DEAD_RESPONSE * max(means)
+    return dataclasses.replace(bad_pixels, hot=union(bad_pixels.hot, stuck))
 
 
 def _with_odd_responses(

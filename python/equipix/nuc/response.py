@@ -49,7 +49,8 @@ class Response(CorrectionBase, Record, kind="response", version=2):
         Number of levels at which the pixel has a value.
     flags : ndarray, shape (rows, cols), uint32
         Bits of `equipix.Flag`. ``DEAD`` rises by less than half as much as its neighbours, ``HOT``
-        by more than twice as much; the dark and the noise set them as in `equipix.calibrate`.
+        by more than twice as much, or saturates at each level, also where its neighbours are far
+        below; the dark and the noise set them as in `equipix.calibrate`.
         ``NONLINEAR`` does not rise everywhere, ``NO_FLAT_FIELD`` has too few levels.
     levels : ndarray, shape (n,), float64
         Array's mean V̄ of each level, in DN.
