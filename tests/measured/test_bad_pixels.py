@@ -90,6 +90,12 @@ class TestKinds:
         assert places(found.flags, Flag.HOT) == {NOISY, FLICKER}
         assert places(found.flags, Flag.TELEGRAPH) == {FLICKER}
 
+    def test_frames_of_two_sensors_are_refused(self, array, response):
+        other = dataclasses.replace(array, offset_dn=array.offset_dn[::-1])
+        stack = np.concatenate([frames(array, 8e6, 100, 99), frames(other, 8e6, 8, 98)])
+        with pytest.raises(errors.InputError, match="'frames' 99 and 100.* of two series or two"):
+            nuc.find_defects(response, stack)
+
     def test_averages_show_noise_but_no_flicker(self, array, response):
         average = equipix.average(frames(array, 8e6, 100, 99))
         found = nuc.find_defects(response, average)

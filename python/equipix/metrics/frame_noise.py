@@ -54,6 +54,8 @@ class Temporal(NamedTuple):
     frames: int
     drift: float
     """Standard deviation of the frame means."""
+    changes: Floats
+    """Mean absolute difference of each two successive frames, of a part of many pixels."""
 
     @property
     def steadiness(self) -> Steadiness:
@@ -143,6 +145,8 @@ def temporal_of(stack: Frames, mask: Bools | None = None) -> Temporal:
     used = used_in(stack, mask)
     mean, squares, steps = (np.zeros(stack.shape[1:]) for _ in range(3))
     levels: list[float] = []
+    changes: list[float] = []
+    part = chosen(used)
     before: Array = np.zeros(0)
     for index, frame in enumerate(stack, start=1):
         levels.append(float(frame[used].astype(np.float64).mean()) if used.any() else 0.0)
@@ -154,10 +158,15 @@ def temporal_of(stack: Frames, mask: Bools | None = None) -> Temporal:
                 squares[rows] += deviation * (free - mean[rows])
                 if index > 1:
                     steps[rows] += (free - (before[rows].astype(np.float64) - levels[-2])) ** 2
+        if index > 1 and part.size:
+            both = (each.reshape(-1)[part].astype(np.float64) for each in (frame, before))
+            change = np.subtract(*both) - (levels[-1] - levels[-2])
+            changes.append(float(np.abs(change).mean()))
         before = frame
     squares /= len(levels) - 1
     mean += np.mean(levels)
-    return Temporal(mean, squares, steps, used, len(levels), float(np.std(levels, ddof=1)))
+    drift = float(np.std(levels, ddof=1))
+    return Temporal(mean, squares, steps, used, len(levels), drift, np.array(changes))
 
 
 def _on_drift(found: Steadiness) -> str | None:

@@ -15,7 +15,7 @@ from equipix.measured.colour import Colours, Filters, planes_of
 from equipix.measured.defects import DefectLimits
 from equipix.measured.part import blocks, known_part, spread
 from equipix.measured.statistics import FrameStatistics, Light, light_of
-from equipix.metrics.frame_noise import STEADY, stack_of, temporal_of
+from equipix.metrics.frame_noise import STEADY, Temporal, stack_of, temporal_of
 from equipix.nuc.curves import response_at
 from equipix.nuc.level_rules import CURVES, Curves
 from equipix.nuc.response import Response, common_misfit
@@ -25,6 +25,10 @@ _SAMPLED = 4096
 
 _CORRELATED = 0.5
 """Correlation of successive frames from which flicker must be found."""
+
+_NEW_SERIES = 0.25
+"""Excess of the difference of two successive frames from which their pattern differs: by the
+noise of a pixel."""
 
 
 def mean_slope(response: Response) -> Floats:
@@ -95,7 +99,9 @@ def of_frames(
     else:
         over_time = temporal_of(given, ~good)
         said = say(*ask(STEADY, over_time.steadiness))
-        mean, variance, steps, _, count, _ = over_time
+        if not said:
+            _refuse_series(over_time)
+        mean, variance, steps, _, count, *_ = over_time
         sampled = np.unravel_index(spread(good.size, _SAMPLED), good.shape)
         step = noise.step_of(np.array([frame[sampled] for frame in given]))
     if count < 2:
@@ -117,6 +123,22 @@ def of_frames(
         flickering[flickering] = defects.flickering_pixels(*of_pixels, count, limits.correlation)
         found["flickering"] = flickering
     return found, said
+
+
+def _refuse_series(found: Temporal) -> None:
+    """Refuse frames of which two successive ones differ in their pattern, not by noise alone."""
+    if not found.changes.size:
+        return
+    usual, largest = np.median(found.changes), np.argmax(found.changes)
+    # A mean absolute difference of N pixels errs by 0.76/√N.
+    limit = 1 + max(_NEW_SERIES, defects.SIGMAS / np.sqrt(np.count_nonzero(found.used)))
+    if found.changes[largest] > limit * usual > 0:
+        raise InputError(
+            f"'frames' {largest} and {largest + 1}, counted from 0, differ "
+            f"{found.changes[largest] / usual:.3g} times as much as two frames usually do "
+            f"(limit {limit:.3g}): they are of two series or two sensors, or the camera has renewed "
+            "its offsets between them: give frames of one series"
+        )
 
 
 def too_few_for_flicker(frames: object, limits: DefectLimits) -> dict[str, str]:
@@ -240,7 +262,8 @@ def find_defects(
     ------
     InputError
         If an argument is of another type, the frames are of another shape, fewer than two, or
-        without a value, or `cfa` is no pattern or another than that of the response.
+        without a value, or those of two series, which differ in their pattern; or `cfa` is no
+        pattern or another than that of the response.
 
     Warns
     -----
