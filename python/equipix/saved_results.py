@@ -30,7 +30,7 @@ _NO_CORRECTIONS = (
     (
         DynamicCorrection,
         "a dynamic correction",
-        "save its correction(...) of a state, or give the state to equipix correct (--substrate-c)",
+        "save its correction(...) of a state, or give the state (--substrate-c)",
     ),
     (FrameStatistics, "frame statistics", "equipix correct subtracts them as --dark"),
     (SceneCorrection, "the state of a scene correction", "save its correction(), equipix scene -o"),

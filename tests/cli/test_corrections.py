@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import bolometer, lens, simulate
+from equipix import bolometer, hardware, lens, metrics, simulate
 from equipix.io.frames import header, read_frames
 from equipix.io.tiff import write_frames
 from equipix.report.maps import maps_of
@@ -251,13 +251,33 @@ class TestBolometer:
         )
         no = tmp_path / "no.tif"
         for words, *given in (
-            ("give the state to equipix correct (--substrate-c)", out, frames),
+            ("give the state (--substrate-c)", out, frames),
             ("--substrate-c is missing, but", out, frames, "--bias-v", "2"),
             ("--substrate-c is 90 °C, but the references cover", out, frames, *state[:1], "90"),
             ("--substrate-c is given, but", tmp_path / "plain.npz", frames, *state[:2]),
         ):
             status, _, err = run("correct", *given, "-o", no)
             assert (status, words in err, no.exists()) == (1, True, False), err
+
+    def test_other_commands_take_a_state_too(self, run, folder, tmp_path):
+        out, plain = tmp_path / "dynamic.npz", tmp_path / "plain.npz"
+        bodies = ("--cold", folder / "cold*.npy", "--hot", folder / "hot*.npy", "--order", "2")
+        assert run(*self.command(folder, out, *bodies))[0] == 0
+        equipix.Polynomial(
+            np.stack([np.zeros((24, 32)), np.ones((24, 32))]), np.zeros((24, 32), np.uint32)
+        ).save(plain)
+        state, at = ("--substrate-c", "20", "--bias-v", "2"), equipix.load(out).correction(20, 2)
+        assert run("combine", out, plain, *state, "-o", tmp_path / "both.npz")[0] == 0
+        both = equipix.load(tmp_path / "both.npz")
+        np.testing.assert_array_equal(both.coefficients, at.coefficients)
+        assert run("hardware", out, *state, "-o", tmp_path / "table.bin")[0] == 0
+        wanted = hardware.Table.of(at)
+        np.testing.assert_array_equal(equipix.load(tmp_path / "table.bin").gain, wanted.gain)
+        raw = np.load(folder / "hot2.npy") + np.random.default_rng(1).normal(size=(4, 24, 32))
+        np.save(tmp_path / "raw.npy", raw)
+        status, printed, _ = run("nuc", "quality", out, tmp_path / "raw.npy", *state, "--json")
+        assert status == 0
+        assert json.loads(printed)["C"] == metrics.correctability(at.correct(raw)).ratio
 
     def test_the_commands_of_the_page_run(self, run, folder, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)

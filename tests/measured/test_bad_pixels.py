@@ -93,7 +93,7 @@ class TestKinds:
     def test_frames_of_two_sensors_are_refused(self, array, response):
         other = dataclasses.replace(array, offset_dn=array.offset_dn[::-1])
         stack = np.concatenate([frames(array, 8e6, 100, 99), frames(other, 8e6, 8, 98)])
-        with pytest.raises(errors.InputError, match="'frames' 99 and 100.* of two series or two"):
+        with pytest.raises(errors.InputError, match="'frames' 99 and 100.* of two series or sens"):
             nuc.find_defects(response, stack)
 
     def test_averages_show_noise_but_no_flicker(self, array, response):

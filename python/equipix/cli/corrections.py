@@ -38,12 +38,15 @@ def combine(
     first: Annotated[Path, typer.Argument(help=f"A correction of raw frames: {READ}.")],
     then: Annotated[Path, typer.Argument(help="Offset and gain of frames that it corrected.")],
     output: Annotated[Path, typer.Option("--output", "-o", help=f"The correction: {SAVED}.")],
+    substrate_c: terminal.SubstrateC = None,
+    bias_v: terminal.BiasV = None,
     force: terminal.Force = False,
     as_json: terminal.Json = False,
 ) -> None:
     """Make one correction of two that are applied in turn."""
     terminal.check_output(output, [first, then], force=force, suffixes=SUFFIXES)
-    both = combine_corrections(load_correction(first), load_correction(then))
+    of_raw = load_correction(first, substrate_c=substrate_c, bias_v=bias_v)
+    both = combine_corrections(of_raw, load_correction(then))
     both = replace(both, metadata=with_inputs(both.metadata, sha256_of([first, then])))
     say(*both.findings)
     terminal.show_saved(output, both, force=force, as_json=as_json)

@@ -95,13 +95,8 @@ def correct(
             "with their headers, of others .tif.",
         ),
     ],
-    substrate_c: Annotated[
-        float | None,
-        typer.Option(help="Temperature of the substrate in °C, for a correction that follows it."),
-    ] = None,
-    bias_v: Annotated[
-        float | None, typer.Option(help="Bias in volts, for a correction that follows it.")
-    ] = None,
+    substrate_c: terminal.SubstrateC = None,
+    bias_v: terminal.BiasV = None,
     sensor: terminal.Sensor = None,
     workers: terminal.Workers = None,
     force: terminal.Force = False,

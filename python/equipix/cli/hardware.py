@@ -67,6 +67,8 @@ def hardware(
             "correction."
         ),
     ] = None,
+    substrate_c: terminal.SubstrateC = None,
+    bias_v: terminal.BiasV = None,
     sensor: terminal.Sensor = None,
     force: terminal.Force = False,
     as_json: terminal.Json = False,
@@ -83,7 +85,7 @@ def hardware(
             f"'frames' is given, but '{output}' holds gains alone, and their cost is that of gains "
             f"and offsets: leave it out, or write {', '.join(SUFFIXES)}"
         )
-    correction = load_correction(result)
+    correction = load_correction(result, substrate_c=substrate_c, bias_v=bias_v)
     check_sensor(correction, sensor)
     table = Table.of(correction, **options)
     cost, said = _cost(result, correction, frames, options) if frames else ({}, ())

@@ -121,6 +121,8 @@ def quality(
     confidence: Annotated[
         float, typer.Option(help="Probability of the confidence interval.")
     ] = 0.95,
+    substrate_c: terminal.SubstrateC = None,
+    bias_v: terminal.BiasV = None,
     cfa: terminal.Cfa = None,
     sensor: terminal.Sensor = None,
     as_json: terminal.Json = False,
@@ -131,7 +133,7 @@ def quality(
 
     Behind colour filters that of each plane: of the correction's, or of --cfa, where it names none.
     """
-    loaded = load_correction(correction)
+    loaded = load_correction(correction, substrate_c=substrate_c, bias_v=bias_v)
     check_sensor(loaded, sensor)
     colours = named_cfa(loaded, cfa)
     with naming_memory("measuring quality"):

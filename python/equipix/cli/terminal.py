@@ -285,6 +285,15 @@ Cfa = Annotated[
     ),
 ]
 
+SubstrateC = Annotated[
+    float | None,
+    typer.Option(help="Temperature of the substrate in °C, for a correction that follows it."),
+]
+
+BiasV = Annotated[
+    float | None, typer.Option(help="Bias in volts, for a correction that follows it.")
+]
+
 Sensor = Annotated[
     str | None,
     typer.Option(
