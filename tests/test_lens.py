@@ -377,6 +377,9 @@ class TestCombine:
         with pytest.raises(errors.InputError, match="'then' has degree 3"):
             equipix.combine(response, response)
         line = response.coefficients[:2]
+        once = equipix.Polynomial(line, response.flags)
+        with pytest.raises(errors.InputError, match="gains of 'first', which would be applied tw"):
+            equipix.combine(once, equipix.Polynomial(line, response.flags, {"other": 1}))
         one, other = (
             equipix.Polynomial(line, response.flags, {"sensor": {"name": name}}) for name in "AB"
         )

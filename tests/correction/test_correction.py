@@ -181,7 +181,7 @@ PRODUCERS = {
         nuc.fit(levels(dark=True), order=1),
         {"takes_dark": True, "dark": True, "limits": True, "saturation": 16000.0, "bits": 14},
     ),
-    "Polynomial": lambda _: (equipix.combine(falloff().correction(), falloff().correction()), {}),
+    "Polynomial": lambda _: (equipix.combine(falloff().correction(), ones(falloff())), {}),
     "Polynomial of raw levels": lambda _: (
         equipix.combine(first := nuc.fit(levels(), order=1), ones(first)),
         RAW | {"saturation": 16000.0, "bits": 14},

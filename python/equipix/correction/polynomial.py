@@ -91,8 +91,8 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     InputError
         If the sensors differ in shape, or in the name or the bit depth where both metadata have
         one, or `then` is of an order above 1, subtracts a dark frame, or is of raw frames: a
-        response to averages of raw levels, or the result of a scene method; or `then` is a gain
-        alone, and `first` leaves an offset in frames that it has corrected, as a response to
+        response to averages of raw levels, or the result of a scene method, or has the offsets and
+        gains of `first`; or `then` is a gain alone, and `first` leaves an offset in frames that it has corrected, as a response to
         averages of raw levels, a scene method or a correction of bolometers: the gain would
         multiply it.
 
@@ -102,8 +102,9 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     >>> import equipix
     >>> gain = np.array([[0.9, 1.0, 1.1]])
     >>> response = equipix.nuc.fit([100 * gain, 1000 * gain], order=1)
-    >>> twice = equipix.combine(response, response)
-    >>> bool(np.allclose(twice.coefficients[1], response.coefficients[1] ** 2))
+    >>> lens = equipix.Polynomial(np.array([[[0.0, 0, 0]], [[1.1, 1, 1.2]]]), response.flags)
+    >>> both = equipix.combine(response, lens)
+    >>> bool(np.allclose(both.coefficients[1], lens.coefficients[1] * response.coefficients[1]))
     True
     """
     check_correction("first", first)
@@ -124,15 +125,22 @@ def combine(first: Correction, then: Correction) -> Polynomial:
         )
     gain = after[1] if len(after) == 2 else 0.0
     _refuse_raw(then)
+    before = np.asarray(first.coefficients, np.float64)
+    multiplies = np.any(np.nan_to_num(gain, nan=1.0) != 1.0)
+    if multiplies and np.array_equal(before, after, equal_nan=True):
+        raise InputError(
+            "'then' has the offsets and gains of 'first', which would be applied twice: expected "
+            "a correction of frames that 'first' has corrected"
+        )
     leaves = first.leaves_offset and not np.nan_to_num(after[0]).any()
-    if leaves and np.any(np.nan_to_num(gain, nan=1.0) != 1.0):
+    if leaves and multiplies:
         raise InputError(
             "'first' leaves an offset in corrected frames, as a response to raw levels, a scene "
             "method or a correction of bolometers does, and the gain of 'then' would multiply it: "
             "average levels with a dark, equipix.average(frames, dark=dark), and fit again, or "
             "subtract a corrected frame without light, such as of a shutter, before 'then'"
         )
-    coefficients = np.asarray(first.coefficients, np.float64) * gain
+    coefficients = before * gain
     coefficients[0] += after[0]
     metadata = made(first=first.metadata, then=then.metadata)
     if sensor:
