@@ -81,6 +81,9 @@ class TestCombine:
         assert run("combine", tmp_path / "a.npz", tmp_path / "b.npz", "-o", out)[0] == 0
         wanted = equipix.combine(first, then)
         assert equipix.load(out).coefficients.tobytes() == wanted.coefficients.tobytes()
+        status, _, err = run("combine", out, tmp_path / "b.npz", "-o", tmp_path / "d.npz")
+        assert status == 1
+        assert f"{out} was combined with {tmp_path / 'b.npz'} already, which would be" in err
 
     def test_says_what_limits_the_two(self, run, tmp_path):
         """Such as a lens that was fitted to frames with their dark."""
@@ -140,6 +143,16 @@ class TestLens:
         assert [each["kind"] for each in json.loads(printed)["findings"]] == ["raw"]
         assert [each.kind for each in equipix.load(out).findings] == ["raw"]
         assert {"k1", "k2"} <= set(json.loads(printed))
+
+    def test_a_flat_that_is_corrected_already_is_a_finding(self, run, tmp_path, light):
+        np.save(tmp_path / "flat.npy", light ** (1 / 1000))
+        given = (tmp_path / "flat.npy", "-o", tmp_path / "lens.tif", "--json")
+        status, printed, err = run("lens", *given)
+        found = lens.fit(light ** (1 / 1000))
+        assert status == 0
+        assert [each["kind"] for each in json.loads(printed)["findings"]] == ["falloff"]
+        focal, error = found.focal_length, found.std["focal_length"]
+        assert f"f is {focal:.4g} ± {error:.2g} pixels by noise alone" in err
 
     def test_figures_have_units_and_the_map_is_the_gain(self, run, tmp_path, light):
         np.save(tmp_path / "flat.npy", light)

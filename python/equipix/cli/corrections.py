@@ -19,12 +19,16 @@ from equipix.findings import Finding, say
 from equipix.io.formats import SAVED, SUFFIXES
 from equipix.io.paths import find_files, refuse_inputs
 from equipix.io.record import read_record
+from equipix.lens import LensFalloff
 from equipix.lens import fit as fit_lens
 from equipix.measured.average import average
 from equipix.report.figures import summary
 from equipix.saved_results import READ, load_correction
 
 commands = typer.Typer()
+
+_LEAST_FALLOFF = 1e-3
+"""Share of the light that a lens takes in the corner, below which it may as well be the sensor."""
 
 _OFFSET = (
     "no dark was subtracted from frames of whole numbers, so that an offset of the camera counts "
@@ -47,9 +51,22 @@ def combine(
     terminal.check_output(output, [first, then], force=force, suffixes=SUFFIXES)
     of_raw = load_correction(first, substrate_c=substrate_c, bias_v=bias_v)
     both = combine_corrections(of_raw, load_correction(then))
-    both = replace(both, metadata=with_inputs(both.metadata, sha256_of([first, then])))
+    hashes = sha256_of([first, then])
+    if hashes[then] in _combined(of_raw.metadata):
+        raise InputError(
+            f"{first} was combined with {then} already, which would be applied twice: expected a "
+            "correction of frames that the first has corrected"
+        )
+    both = replace(both, metadata=with_inputs(both.metadata, hashes))
     say(*both.findings)
     terminal.show_saved(output, both, force=force, as_json=as_json)
+
+
+def _combined(metadata: dict[str, Any]) -> set[str]:
+    """Hashes of the files of the corrections that one was combined of."""
+    parts = [metadata[name] for name in ("first", "then") if name in metadata]
+    found = set(metadata.get("inputs", {}).values()) if parts else set()
+    return found.union(*map(_combined, parts))
 
 
 @commands.command(epilog="Example: equipix lens flat/*.tif --dark 'dark/*.tif' -o lens.tif")
@@ -81,11 +98,24 @@ def lens(
     found = fit_lens(flat.mean, sensitivity=gain, mask=flat.saturated > 0, cfa=cfa, **options)
     made = found.correction()
     least = float(1 / np.nanmax(made.coefficients[1]))
+    if 1 - least < _LEAST_FALLOFF:
+        said += say(Finding("falloff", _weak(found, 1 - least), "identifiability"))
     origin = {**made.metadata, "std": found.std, "least_illumination": least}
     origin["inputs"] = flat.metadata["inputs"]
     origin = with_inputs(origin, sha256_of(terminal.given(sensitivity)))
     made = replace(made, metadata=origin, findings=said)
     terminal.show_saved(output, made, force=force, as_json=as_json)
+
+
+def _weak(found: LensFalloff, falloff: float) -> str:
+    """Say that a fall-off is too weak to be that of a lens, and how far f is off by noise alone."""
+    focal = f": f is {found.focal_length:.4g} ± {found.std.get('focal_length', 0):.2g} pixels"
+    return (
+        f"the fall-off takes {falloff:.2g} of the light in the corner (limit {_LEAST_FALLOFF:g}), "
+        f"too weak to determine a law{focal if found.law == 'cos4' else ''} by noise alone, and "
+        "large scales of the sensor's gain are as large: see that the flat has not been corrected "
+        "for its fall-off already"
+    )
 
 
 @commands.command(
