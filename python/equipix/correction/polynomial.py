@@ -92,9 +92,9 @@ def combine(first: Correction, then: Correction) -> Polynomial:
         If the sensors differ in shape, or in the name or the bit depth where both metadata have
         one, or `then` is of an order above 1, subtracts a dark frame, or is of raw frames: a
         response to averages of raw levels, or the result of a scene method, or has the offsets and
-        gains of `first`; or `then` is a gain alone, and `first` leaves an offset in frames that it has corrected, as a response to
-        averages of raw levels, a scene method or a correction of bolometers: the gain would
-        multiply it.
+        gains of `first`; or `then` is a gain alone, and `first` leaves an offset in frames that it
+        has corrected, as a response to averages of raw levels, a scene method or a correction of
+        bolometers: the gain would multiply it.
 
     Examples
     --------

@@ -275,8 +275,8 @@ _STEPS = 65
 
 def line_of(
     correction: Correction, linearise: tuple[float, float] | None, largest: float
-) -> tuple[tuple[Floats, Floats], float]:
-    """Offset and gain of each pixel, and the largest sag of a curve that a line replaces, in DN.
+) -> tuple[tuple[Floats, Floats], Floats]:
+    """Offset and gain of each pixel, and the sag of each usable curve that a line replaces, in DN.
 
     The sag is the range of the difference between the curve and the line through its ends.
 
@@ -297,7 +297,7 @@ def line_of(
                 "(--linearise), two raw values in DN between which a straight line takes the place "
                 "of the curve"
             )
-        return (planes[0], planes[1]), 0.0
+        return (planes[0], planes[1]), np.zeros(0)
     return _chord(planes, usable(correction.flags), *_checked_range(linearise, largest))
 
 
@@ -324,8 +324,8 @@ def _checked_range(linearise: object, largest: float) -> tuple[float, float]:
 
 def _chord(
     planes: Floats, used: Bools, low: float, high: float
-) -> tuple[tuple[Floats, Floats], float]:
-    """Line parallel to the chord with the smallest largest deviation, and the largest sag."""
+) -> tuple[tuple[Floats, Floats], Floats]:
+    """Line parallel to the chord with the smallest largest deviation, and the sag if usable."""
     ends = [np.asarray(polyval(value, planes)) for value in (low, high)]
     gain = (ends[1] - ends[0]) / (high - low)
     offset = ends[0] - gain * low
@@ -335,4 +335,4 @@ def _chord(
         lowest, highest = np.minimum(lowest, away), np.maximum(highest, away)
     sag = (highest - lowest)[used & np.isfinite(gain)]
     # Half of the sag is left on either side.
-    return (offset + (lowest + highest) / 2, gain), float(sag.max(initial=0))
+    return (offset + (lowest + highest) / 2, gain), sag

@@ -182,7 +182,8 @@ class Table(RawCorrection, Content):
         -----
         InputWarning
             If words are off by more than 0.5 % of the range of the ADC, or the ADC does not hold
-            the raw values of the sensor's bit depth, where the metadata have that.
+            the raw values of the sensor's bit depth, where the metadata have that; or if the line
+            of `linearise` leaves a pattern of more than a step of the ADC.
         """
         check_correction("correction", correction)
         if adc_bits is None:
@@ -203,13 +204,14 @@ class Table(RawCorrection, Content):
         )
         with naming_memory("making a table"):
             largest = _largest_raw(correction, adc)
-            line, sag = line_of(correction, linearise, largest)
+            line, sags = line_of(correction, linearise, largest)
             found = encode(line, correction.flags, widths, steps, float(lowest))
             refuse_far_lowest(found, line, largest)
             refuse_far_offsets(found, line, widths, steps, float(lowest))
         colours, source = correction.colours, origin(correction)
         depth = correction.bits if source.get("sensor", {}).get("bit_depth") else 0
-        said = say(*_limits(found, depth))
+        sag, pattern = float(sags.max(initial=0)), float(np.std(sags)) / 2 if sags.size else 0.0
+        said = say(*_limits(found, depth, sag, pattern))
         metadata = {
             **source,
             **({} if colours is None else {"cfa": colours.rows}),
@@ -360,8 +362,12 @@ def _largest_raw(correction: Correction, adc: int) -> float:
     return float(2**bits - 1 if bits else np.ldexp(2.0**WIDEST - 1, adc))
 
 
-def _limits(made: Content, depth: int) -> tuple[Finding, ...]:
-    """Say what words lose of a correction, of a sensor of so many bits; 0 if that is not known."""
+def _limits(made: Content, depth: int, sag: float, pattern: float) -> tuple[Finding, ...]:
+    """Say what words lose of a correction, of a sensor of so many bits; 0 if that is not known.
+
+    A line in place of curves leaves half of their sags: at the ends of its range, and in its middle
+    with the opposite sign. Their standard deviation over the pixels is the pattern.
+    """
     f, error = made.format, made.metadata["largest_error_dn"]
     full = 2.0 ** (f.adc_bits + f.adc)
     end = full + float(np.mean(made.coarse)) * 2.0**f.coarse
@@ -375,7 +381,17 @@ def _limits(made: Content, depth: int) -> tuple[Finding, ...]:
         f"of {depth} bits are beyond it: they become the word {f.largest_word}: take 'adc_bits' "
         f"{depth}, or 'adc_step' {2.0 ** (depth - f.adc_bits):g}"
     )
-    found = ("words", coarse, error > _COARSE * full), ("range", beyond, end < _KEPT * 2**depth)
+    bent = (
+        f"the line that 'linearise' puts in place of curves leaves up to {sag / 2:.3g} DN, and a "
+        f"pattern with a standard deviation of {pattern:.3g} DN over the pixels (limit, a step of "
+        f"the ADC: {2.0**f.adc:g} DN): name a narrower range, or compare C and C of the table by "
+        "hardware.quality (--frames)"
+    )
+    found = (
+        ("words", coarse, error > _COARSE * full),
+        ("range", beyond, end < _KEPT * 2**depth),
+        ("line", bent, pattern > 2.0**f.adc),
+    )
     return tuple(Finding(kind, words, "input") for kind, words, is_so in found if is_so)
 
 

@@ -136,8 +136,8 @@ def _refuse_series(found: Temporal) -> None:
         raise InputError(
             f"'frames' {largest} and {largest + 1}, counted from 0, differ "
             f"{found.changes[largest] / usual:.3g} times as much as two frames usually do "
-            f"(limit {limit:.3g}): they are of two series or sensors, or the camera has renewed its "
-            "offsets between them: give frames of one series"
+            f"(limit {limit:.3g}): they are of two series or sensors, or the camera has renewed "
+            "its offsets between them: give frames of one series"
         )
 
 
