@@ -22,7 +22,7 @@ from report_results import SHAPE, calibration, every_kind, measured
 import equipix
 from equipix import detector, hardware, lens, metrics, nuc, plan, scene, simulate
 from equipix.errors import FileError
-from equipix.findings import Finding
+from equipix.findings import Finding, usable
 from equipix.pictures import new_figure
 from equipix.report import camera
 from equipix.report.drawing import (
@@ -44,7 +44,7 @@ from equipix.report.limits import (
     read_limits,
 )
 from equipix.report.maps import Map, maps_of
-from equipix.report.page import mapped, page, part_of
+from equipix.report.page import mapped, page, part_of, provenance_of
 from equipix.scene.methods import METHODS
 from given import learned, written_camera
 
@@ -117,6 +117,46 @@ def test_values_under_the_pointer_are_those_of_the_map(results):
     read = low + (high - low) * (words[known] - 1.0) / 65534
     # Rounded to the nearest of 65 534 steps.
     np.testing.assert_allclose(read, cal.sensitivity[known], atol=0.51 * (high - low) / 65534)
+
+
+def test_flagged_pixels_do_not_scale_a_map(results):
+    response = results["response"]
+    planes = response.deviation.copy()
+    planes[1, 3:6, 4] = 50.0
+    flags = response.flags.copy()
+    flags[3:6, 4] |= np.uint32(equipix.Flag.DO_NOT_USE)
+    good = planes[1][usable(flags)]
+    for largest in (480, 16):  # single pixels, and means of blocks
+        bad = dataclasses.replace(response, deviation=planes, flags=flags)
+        shown = mapped(maps_of(bad)[1], largest)
+        assert float(shown["last"]) <= abs(good).max() * 1.001
+        assert float(shown["high"]) > 10  # what a pointer reads is the value itself
+
+
+def test_curves_of_a_response_are_of_offset_and_gain(results):
+    titles = [each["title"] for each in part_of("r", results["response"], NOTHING).plots]
+    assert {
+        f"{kind} of {name}"
+        for kind in ("Histogram", "Spectrum")
+        for name in ("offset a", "gain deviation K")
+    } <= set(titles)
+    assert len(titles) == len(set(titles))
+
+
+def test_provenance_is_in_words():
+    metadata = {
+        "levels": [{"name": "1", "value": None}, {"name": "2", "frames": [1, 2.5]}],
+        "options": {"robust": True, "shifts": [[0, 1], [2, 3]], "mask": []},
+    }
+    assert provenance_of(metadata) == [
+        ("levels 1: name", "1"),
+        ("levels 1: value", "none"),
+        ("levels 2: name", "2"),
+        ("levels 2: frames", "1, 2.5"),
+        ("options: robust", "yes"),
+        ("options: shifts", "(0, 1), (2, 3)"),
+        ("options: mask", "none"),
+    ]
 
 
 @pytest.mark.parametrize(("shape", "step"), [((30, 40), 1), ((30, 41), 2), ((81, 100), 4)])
@@ -572,7 +612,8 @@ class TestCamera:
             assert f"{number} {unit}".strip() in words[name].split(", ")
         for title in (
             *("Responsivity", "Photon transfer", "Deviation from linearity", "Mean of the dark"),
-            *("Signal-to-noise ratio", "Spectrum of dark signal", "Profiles of photo response"),
+            *("Signal-to-noise ratio", "Spectrum of dark signal"),
+            *(f"Profiles of photo response along {along}" for along in ("rows", "columns")),
             "Histogram of photo response, high-passed",
         ):
             assert f'aria-label="{title}"' in text

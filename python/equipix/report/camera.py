@@ -330,7 +330,9 @@ def _draw_profiles(axes: Axes, shown: Map, axis: int) -> None:
     axes.plot(middle, label="middle", **_FINE)
     axes.plot(values.mean(axis), label="mean", **_FINE)
     axes.plot(values.min(axis), label="smallest", **_FINE)
-    axes.set(title=f"Profiles of {shown.name.lower()}", xlabel=("column", "row")[axis])
+    along = ("rows", "columns")[axis]
+    axes.set(title=f"Profiles of {shown.name.lower()} along {along}")
+    axes.set(xlabel=("column", "row")[axis])
     axes.set_ylabel(shown.unit)
     axes.margins(y=0.2)
     axes.legend(fontsize="small", loc="upper center", ncols=4)

@@ -11,6 +11,7 @@ import numpy as np
 from equipix._check import Array, Floats
 from equipix.calibration.result import Calibration
 from equipix.measured.noise import nanmedian
+from equipix.nuc.response import Response
 from equipix.pictures import new_figure
 from equipix.report.maps import Map, flagged, maps_of
 
@@ -50,8 +51,8 @@ def draw_result(result: Any) -> Figure:
     -------
     matplotlib.figure.Figure
         A map of each value, with the smallest and the largest one; the flagged pixels by kind; the
-        histogram of the first map on a logarithmic scale; of a calibration also its profiles and
-        its shifts.
+        histogram, the profiles and the spectrum of the first map, of a response also of the second;
+        of a calibration also its convergence and its shifts.
 
     Raises
     ------
@@ -62,7 +63,7 @@ def draw_result(result: Any) -> Figure:
     drawn: list[Callable[[Axes], None]] = [partial(draw_map, shown=each) for each in maps]
     if flags is not None:
         drawn.append(partial(draw_flags, flags=flags))
-    drawn += curves_of(result, maps[0])
+    drawn += curves_of(result, maps)
     cols = min(3, len(drawn))
     rows = -(-len(drawn) // cols)
     figure = new_figure(5.2 * cols, 4.2 * rows)
@@ -74,10 +75,13 @@ def draw_result(result: Any) -> Figure:
     return figure
 
 
-def curves_of(result: Any, first: Map) -> list[Callable[[Axes], None]]:
-    """Functions that draw the curves of a result, whose first map is given."""
+def curves_of(result: Any, maps: list[Map]) -> list[Callable[[Axes], None]]:
+    """Functions that draw the curves of a result: of its first map, of a response also of K."""
+    shown = maps[: 2 if isinstance(result, Response) and result.order else 1]
     drawn: list[Callable[[Axes], None]] = [
-        partial(draw, shown=first) for draw in (draw_histogram, draw_profiles, draw_spectrum)
+        partial(draw, shown=each)
+        for each in shown
+        for draw in (draw_histogram, draw_profiles, draw_spectrum)
     ]
     if isinstance(result, Calibration):
         of_fit = (draw_convergence, draw_shifts)
@@ -85,9 +89,13 @@ def curves_of(result: Any, first: Map) -> list[Callable[[Axes], None]]:
     return drawn
 
 
-def limits_of(shown: Map, values: Floats) -> tuple[float, float]:
-    """Ends of the colours: two percentiles of what is shown, even around 0 for deviations."""
-    known = values[np.isfinite(values)]
+def limits_of(shown: Map, values: Floats, step: int = 1) -> tuple[float, float]:
+    """Ends of the colours: two percentiles of what is shown, even around 0 for deviations.
+
+    `values` are those of blocks of `step` pixels. Blocks with a pixel that must not be used do not
+    count, if there are others.
+    """
+    known = shown.usual(values, step)
     if not known.size:
         return 0.0, 1.0
     low, high = (float(end) for end in np.percentile(known, _SHARES))
@@ -102,7 +110,7 @@ def limits_of(shown: Map, values: Floats) -> tuple[float, float]:
 def draw_map(axes: Axes, shown: Map) -> None:
     """Draw a map with its scale, its smallest and its largest value."""
     values, step = shown.reduced()
-    low, high = limits_of(shown, values)
+    low, high = limits_of(shown, values, step)
     rows, cols = (step * size for size in values.shape)
     extent = (-0.5, cols - 0.5, rows - 0.5, -0.5)
     image = axes.imshow(

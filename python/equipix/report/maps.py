@@ -1,13 +1,13 @@
 """What results hold, as maps with names and units, reduced to what a picture can show."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 
-from equipix._check import Array, Floats
+from equipix._check import Array, Bools, Floats
 from equipix.bolometer.dynamic import DynamicCorrection
 from equipix.calibration.result import Calibration
 from equipix.comparison import Comparison
@@ -44,6 +44,8 @@ class Map:
         Whether they lie around a level of their own, around 0, or above it.
     cell : int
         Pixels along the side of what has a value.
+    unusable : ndarray of bool, shape (rows, cols), or None
+        Pixels that the ends of the colours ignore.
     """
 
     name: str
@@ -51,6 +53,7 @@ class Map:
     values: Array
     scale: Scale = "level"
     cell: int = 1
+    unusable: Bools | None = None
 
     @property
     def title(self) -> str:
@@ -68,6 +71,14 @@ class Map:
             end(self.values, where=known, initial=first) for end in (np.min, np.max)
         )
         return float(smallest), float(largest)
+
+    def usual(self, values: Floats, step: int) -> Floats:
+        """Those of the values of blocks of so many pixels that have no unusable one, if any."""
+        known = np.isfinite(values)
+        if self.unusable is None:
+            return values[known]
+        good = known & (_means(self.unusable, step) == 0)
+        return values[good if good.any() else known]
 
     def words(self, step: int) -> str:
         """What a picture shows whose points are so many pixels wide, and the extremes."""
@@ -116,8 +127,16 @@ def maps_of(result: Any) -> list[Map]:
     """
     for kind, maps in _MAPS.items():
         if isinstance(result, kind):
-            return [each for each in maps(result) if np.isfinite(each.values).any()]
-    return [*_of_correction(result)]
+            found = [each for each in maps(result) if np.isfinite(each.values).any()]
+            break
+    else:
+        found = [*_of_correction(result)]
+    flags = getattr(result, "flags", None)
+    if flags is None or not flags.any():
+        return found
+    bad = ~usable(flags)
+    same = [each.values.shape == bad.shape for each in found]
+    return [replace(each, unusable=bad if x else None) for each, x in zip(found, same, strict=True)]
 
 
 def _of_calibration(calibration: Calibration) -> Iterator[Map]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import io
-import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
@@ -148,7 +147,7 @@ def part_of(name: str, result: Any, limits: LimitsFile, *, share: int = 1) -> Pa
     if isinstance(result, Calibration) and result.sensitivity_std is None:
         notes = dict.fromkeys(("sensitivity_std", "tilt_std"), f"not known ({_why_none(result)})")
     maps = maps_of(result)
-    curves = curves_of(result, maps[0])
+    curves = curves_of(result, maps)
     if flags is not None and flags.any():
         curves.insert(0, partial(draw_flags, flags=flags))
     return Part(
@@ -245,7 +244,7 @@ def _limits_of(result: Any, limits: LimitsFile) -> Limits:
 def mapped(shown: Map, largest: int = LARGEST) -> dict[str, Any]:
     """Picture, values and words of a map."""
     values, step = shown.reduced(largest)
-    low, high = limits_of(shown, values)
+    low, high = limits_of(shown, values, step)
     known = values[np.isfinite(values)]
     ends = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
     cmap = CMAPS[shown.scale]
@@ -400,6 +399,15 @@ def _words(flag: Flag) -> str:
     return (flag.name or "").replace("_", " ").lower()
 
 
+def _text(value: Any) -> str:
+    """Write a value of the metadata, lists of them with commas between."""
+    if isinstance(value, list):
+        inner = (f"({_text(each)})" if isinstance(each, list) else _text(each) for each in value)
+        return ", ".join(inner) or "none"
+    words = {None: "none", True: "yes", False: "no"}
+    return words[value] if value is None or isinstance(value, bool) else str(value)
+
+
 def provenance_of(metadata: Mapping[str, Any], above: str = "") -> list[tuple[str, str]]:
     """Entries of the metadata by their places, those of tables within tables one by one."""
     found: list[tuple[str, str]] = []
@@ -407,6 +415,9 @@ def provenance_of(metadata: Mapping[str, Any], above: str = "") -> list[tuple[st
         name = f"{above}{key.replace('_', ' ')}"
         if isinstance(value, Mapping):
             found += provenance_of(value, f"{name}: ")
+        elif isinstance(value, list) and any(isinstance(each, Mapping) for each in value):
+            entries = {f"{number}": each for number, each in enumerate(value, start=1)}
+            found += provenance_of(entries, f"{name} ")
         else:
-            found.append((name, value if isinstance(value, str) else json.dumps(value)))
+            found.append((name, _text(value)))
     return found
