@@ -117,6 +117,12 @@ class TestCalibrate:
         cal = equipix.calibrate(exposures(truth), CROSS, variance=np.full(5, NOISE**2), cfa="RGGB")
         assert cal.findings == ()
 
+    def test_greens_that_differ_by_more_are_those_of_the_pattern_that_is_named(self):
+        truth, _ = sensor("RGGB", dead=0)
+        truth[::2, 1::2] *= 1.08
+        with pytest.warns(errors.MisfitWarning, match="write cfa='RGGB' or cfa='BGGR'"):
+            equipix.calibrate(exposures(truth), CROSS, variance=np.full(5, NOISE**2))
+
     def test_a_monochrome_sensor_is_calibrated_as_ever(self):
         truth, good = sensor(None)
         frames = exposures(truth)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import hashlib
 import io
 import json
@@ -22,6 +23,7 @@ from equipix import average, cli, simulate
 from equipix.cli import terminal
 from equipix.errors import FileError
 from equipix.io.frames import read_frames
+from equipix.io.paths import write_whole
 from equipix.io.tiff import write_frames
 
 SHAPE = (64, 80)
@@ -577,6 +579,14 @@ def test_an_output_that_no_folder_takes_is_named_alone(run, experiment):
     assert result[2].count(".tif") == 1
     with pytest.raises(FileError, match="^/proc/x.npz: cannot be written: [^/]*: name another fol"):
         average(np.zeros((2, 3, 4))).save("/proc/x.npz")
+
+
+def test_a_full_disk_is_named(tmp_path):
+    with (
+        pytest.raises(FileError, match=r"x\.npz: cannot be .*: free space, or name another folder"),
+        write_whole(tmp_path / "x.npz", force=False),
+    ):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def test_results_are_no_masks(run, experiment, calibration, tmp_path):

@@ -435,6 +435,14 @@ class TestEmvaTransfer:
         ):
             metrics.emva_transfer(bright, dark, change(light))
 
+    def test_darks_that_are_brighter_than_most_levels_are_named(self):
+        rng = np.random.default_rng(1)
+        light = [10.0, 20, 30, 400]
+        frames = [rng.normal(each, 2, (2, 20, 30)) for each in light]
+        darks = [rng.normal(100.0, 2, (2, 20, 30)) for _ in light]
+        with pytest.raises(errors.InputError, match="1 levels .*3 of 4 are darker than their dark"):
+            metrics.emva_transfer(frames, darks, light)
+
     def test_exchanged_darks_are_refused(self):
         bright, dark, light = self.levels(np.random.default_rng(11))
         with pytest.raises(errors.InputError, match="no level is brighter .* not exchanged"):

@@ -272,7 +272,7 @@ class TestCommands:
         status, out, err = run(*given)
         assert status == 0
         assert "warning: curves of order 1" in err
-        assert "--order 2 or --order auto" in err
+        assert "fit with order 2 or order auto" in err
         assert "curves of order" not in run(*given, "--order", "2")[2]
         two = text.split("[[level]]")
         (tmp_path / "levels.toml").write_text("[[level]]".join(two[:3]), encoding="utf-8")
@@ -300,6 +300,15 @@ class TestDefectsAndQuality:
         response = LevelExperiment.load(folder / "levels.toml").run(order=2)
         response.save(tmp_path / "response.tif")
         return response, tmp_path / "response.tif"
+
+    def test_a_dark_of_another_shape_is_blamed_itself(self, run, folder, tmp_path):
+        write_frames(folder / "small.tif", iter(np.zeros((4, 8, 9), np.uint16)), nbytes=1)
+        text = (folder / "levels.toml").read_text(encoding="utf-8")
+        levels = folder / "other.toml"
+        levels.write_text(text.replace('"dark.tif"', '"small.tif"'), encoding="utf-8")
+        status, _, err = run("nuc", "fit", levels, "-o", tmp_path / "no.tif")
+        assert status == 1
+        assert re.search(r"small\.tif: holds uint16 frames of shape \(8, 9\), expected", err)
 
     def test_defects_are_those_of_the_function(self, run, saved, folder, tmp_path):
         response, path = saved

@@ -148,6 +148,9 @@ def _of_usage(error: Any, given: list[str]) -> str:
         text = text.replace(": expected", f" is {checked()[0]['input']!r}, expected", 1)
     name = next((each for each in given if each in COMMANDS), "")
     place = error.ctx.command_path if error.ctx else f"equipix {name}"
+    called = CALLED.get()
+    if called is not None and called.name not in place.split():
+        place = f"{place} {called.name}"  # wrong before the command of a group began
     CALLED.set(None)  # options are named as they are
     return text and f"{text.rstrip('.')} (see {place} --help)"
 

@@ -348,7 +348,8 @@ def _of_filters(filters: Filters | None) -> tuple[Finding, ...]:
     elif min(rows, cols) > 1:
         words = (
             f"{repeats} by {filters.spread:.0%}, as under colour filters, and no 'cfa' is given in "
-            f"[sensor], so the figures mix the colours and PRNU contains them: {advice(shown)}"
+            "[sensor], so the figures mix the colours and PRNU contains them: "
+            f"{advice(shown, filters.response)}"
         )
     else:
         words = (

@@ -1,6 +1,7 @@
 """Formats, repeats and hashes of image files."""
 
 import hashlib
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
@@ -33,12 +34,13 @@ def check_formats(files: Sequence[Path]) -> tuple[int, int]:
     Raises
     ------
     FileError
-        If a file cannot be read or differs from the first in shape or depth.
+        If a file cannot be read, or differs in shape from most, or in depth from the first of them.
     """
-    first, *others = files
-    wanted, wanted_dtype = _format(first)
-    for file in others:
-        shape, dtype = _format(file)
+    formats = {file: _format(file) for file in files}
+    wanted = Counter(shape for shape, _ in formats.values()).most_common(1)[0][0]
+    first = next(file for file, (shape, _) in formats.items() if shape == wanted)
+    wanted_dtype = formats[first][1]
+    for file, (shape, dtype) in formats.items():
         wanted_dtype = wanted_dtype or dtype
         if shape != wanted or dtype not in (None, wanted_dtype):
             raise FileError(

@@ -1,5 +1,6 @@
 """Names and globs to files, outputs whole or not at all, a reader's failure as an error."""
 
+import errno
 import glob
 import logging
 import os
@@ -228,7 +229,9 @@ def _temporary(target: Path) -> Iterator[Path]:
         raise
     except OSError as error:
         why = error.strerror or error  # without the name of the temporary file
-        raise FileError(f"{target}: cannot be written: {why}: name another folder") from error
+        full = error.errno == errno.ENOSPC
+        todo = "free space, or name another folder" if full else "name another folder"
+        raise FileError(f"{target}: cannot be written: {why}: {todo}") from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
         with suppress(OSError):

@@ -240,7 +240,8 @@ class Filters:
         return (
             f"the response repeats every {rows} rows and {cols} columns by {self.spread:.0%}, as "
             f"under colour filters, and no 'cfa' is given. No pixel is flagged for it, but M mixes "
-            f"the colours, and a corrected frame loses its white balance: {advice(self.colours)}"
+            f"the colours, and a corrected frame loses its white balance: "
+            f"{advice(self.colours, self.response)}"
         )
 
     @property
@@ -253,9 +254,9 @@ class Filters:
         return self.colours.map_of(self.response, shape)
 
 
-def advice(colours: Colours) -> str:
-    """Say which 'cfa' to write for a pattern that values show."""
-    named = _bayer(colours)
+def advice(colours: Colours, response: Mapping[str, float] | None = None) -> str:
+    """Say which 'cfa' to write for a pattern that values show, by the responses if known."""
+    named = _bayer(colours, response)
     write = " or ".join(f"cfa={each!r}" for each in named or [str(colours)])
     return (
         f"write {write} (in [sensor] of a manifest){', as the data sheet has it' if named else ''}"
@@ -405,13 +406,22 @@ def _shortest(numbers: Array, axis: int) -> int:
     return next((s for s in steps if np.array_equal(np.roll(numbers, s, axis), numbers)), size)
 
 
-def _bayer(colours: Colours) -> list[str]:
-    """Orders of Bayer's pattern that have such a diagonal; none of another pattern."""
+def _bayer(colours: Colours, response: Mapping[str, float] | None = None) -> list[str]:
+    """Orders of Bayer's pattern that have such a diagonal; none of another pattern.
+
+    The two greens of a sensor differ by some per cent: letters rise with the response, and those
+    of a diagonal must follow each other. Of two such diagonals that of less difference counts.
+    """
     if colours.period != (2, 2):
         return []
     (a, b), (c, d) = colours.pattern
-    if b == c and a == d:
-        return ["RGGB", "BGGR", "GRBG", "GBRG"]
-    if b == c and b not in (a, d):
-        return ["RGGB", "BGGR"]
-    return ["GRBG", "GBRG"] if a == d and a not in (b, c) else []
+    of_greens = {(b, c): ["RGGB", "BGGR"], (a, d): ["GRBG", "GBRG"]}
+    pairs = [pair for pair in of_greens if pair[0] == pair[1]]
+    if not pairs and len({a, b, c, d}) == 4:
+        pairs = [pair for pair in of_greens if abs(ord(pair[0]) - ord(pair[1])) == 1]
+        if response:
+            apart = {pair: abs(np.log(response[pair[0]] / response[pair[1]])) for pair in pairs}
+            pairs = [pair for pair in pairs if apart[pair] <= 2 * min(apart.values())]
+    elif len(pairs) == 1 and len({a, b, c, d}) < 3:
+        pairs = []
+    return [name for pair in pairs for name in of_greens[pair]]

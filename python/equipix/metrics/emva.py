@@ -456,9 +456,13 @@ def transfer_of(
     below = signal <= TRANSFER * saturation
     linear = linear_levels(signal, saturation)
     if np.count_nonzero(linear) < 3 or not (signal[below] > 0).any():
+        darker = np.count_nonzero(signal < 0)
+        todo = "add levels from dark to above saturation"
+        if 2 * darker > len(signal):
+            todo = f"{darker} of {len(signal)} are darker than their dark: give the darks of these"
         raise InputError(
             f"'frames': {np.count_nonzero(linear)} levels lie between 5 and 95 % of saturation at "
-            f"{saturation:.6g} DN, expected three or more: add levels from dark to above saturation"
+            f"{saturation:.6g} DN, expected three or more: {todo}"
         )
     if not np.ptp(levels[linear]) > 0:
         raise InputError(
