@@ -415,6 +415,7 @@ class TestFindings:
     def test_quantisation_gives_the_bounds_of_the_standard(self, tmp_path, run):
         path = small(tmp_path, gain=0.01)
         assert "quantisation" in self.kinds(path)
+        assert "DSNU is of rounded values, off by up to 0.5 DN" in run("emva", path)[2]
         found = json.loads(run("emva", path, "--json")[1])
         gain = found["gain_dn_per_e"]
         assert found["dark_noise_dn"] == pytest.approx(np.sqrt(0.24))

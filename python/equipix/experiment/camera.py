@@ -452,11 +452,15 @@ def _on_quantisation(found: CameraFigures) -> str | None:
         "Dark current by the variance is not known, and dark current by the mean has errors of "
         "rounding. "
     )
+    # Without noise a pixel shows whole DN alone, so that means of frames are not finer.
+    most = 0.5 / found.transfer.gain_dn_per_e
+    spatial = f"DSNU is of rounded values, off by up to 0.5 DN, {most:.2g} e⁻. "
     return (
         f"the temporal dark noise is {max(found.transfer.dark_noise_dn, 0):.3g} DN, and "
         f"quantisation hides noise below {QUANTISED**0.5:.2g} DN. So dark noise and sensitivity "
         "threshold are upper bounds, and dynamic range is a lower bound. "
-        f"{hidden if found._least < QUANTISED else ''}Use a higher gain of the camera"
+        f"{hidden if found._least < QUANTISED else ''}{spatial if found.spatial else ''}"
+        "Use a higher gain of the camera"
     )
 
 
