@@ -581,6 +581,14 @@ def test_an_output_that_no_folder_takes_is_named_alone(run, experiment):
         average(np.zeros((2, 3, 4))).save("/proc/x.npz")
 
 
+def test_a_usage_error_names_the_help_of_the_command(run):
+    status, _, err = run("nuc", "fit", "levels.toml", "-o")
+    assert (status, err.endswith("requires an argument (see equipix nuc fit --help)\n")) == (
+        2,
+        True,
+    )
+
+
 def test_a_full_disk_is_named(tmp_path):
     with (
         pytest.raises(FileError, match=r"x\.npz: cannot be .*: free space, or name another folder"),

@@ -64,12 +64,6 @@ class TestJson:
             ),
             (("average", "--force=3"), 2, "usage", "not take a value (see equipix average --help)"),
             (("averag", "FRAMES"), 2, "usage", "Did you mean 'average'? (see equipix --help)"),
-            (
-                ("nuc", "fit", "l.toml", "-o"),
-                2,
-                "usage",
-                "an argument (see equipix nuc fit --help)",
-            ),
             (("nuc", "fot"), 2, "usage", "Did you mean 'fit'? (see equipix nuc --help)"),
         ],
     )

@@ -435,12 +435,28 @@ class TestEmvaTransfer:
         ):
             metrics.emva_transfer(bright, dark, change(light))
 
+    def test_the_high_pass_takes_a_part_of_a_white_pattern(self):
+        """What docs/camera.md states: the root of the sum of the squares of the filter."""
+        point = np.zeros((41, 41))
+        point[20, 20] = 1.0
+        kept = float(np.sqrt(np.sum(high_passed(point) ** 2)))
+        assert kept == pytest.approx(0.99423, abs=5e-6)
+        rng = np.random.default_rng(1)
+        pattern = 1000 * (1 + 0.01 * rng.standard_normal((200, 300)))
+        dark = 50 + rng.standard_normal((4, 200, 300))
+        found, plain = (
+            metrics.emva_spatial(dark[::-1] + pattern, dark, highpass=each).prnu.total
+            for each in (True, False)
+        )
+        # Of 60 000 values, of which the filter takes 1.1 % of the variance.
+        assert found / plain == pytest.approx(kept, abs=5 * (1 - kept) / np.sqrt(60_000 / 169))
+
     def test_darks_that_are_brighter_than_most_levels_are_named(self):
         rng = np.random.default_rng(1)
         light = [10.0, 20, 30, 400]
         frames = [rng.normal(each, 2, (2, 20, 30)) for each in light]
         darks = [rng.normal(100.0, 2, (2, 20, 30)) for _ in light]
-        with pytest.raises(errors.InputError, match="1 levels .*3 of 4 are darker than their dark"):
+        with pytest.raises(errors.InputError, match="0 levels .*3 of 4 are darker than their dark"):
             metrics.emva_transfer(frames, darks, light)
 
     def test_exchanged_darks_are_refused(self):
