@@ -17,6 +17,7 @@ import hardware as docs
 import reference
 from equipix import Flag, Polynomial, errors, hardware, metrics, nuc
 from equipix.findings import Finding, usable
+from equipix.hardware.quality import trial, widths_of
 from equipix.hardware.table import UPLOAD
 from equipix.hardware.words import Words
 from equipix.io.tiff import write_frames
@@ -828,6 +829,10 @@ def test_behind_colour_filters_each_plane_is_judged(tmp_path, run):
     # Colours differ by a factor of 4, noise not at all.
     assert found.before.ratio < 1 < metrics.correctability(exact).ratio
     widths = hardware.smallest_widths(response, [raw])
+    told = []
+    tried = trial(response, raw, progress=lambda *each: told.append(each), stage="widths")
+    assert told == [(done, 25, "widths") for done in range(1, 26)]
+    assert widths_of([tried.by_width]).both_bits == widths.both_bits
     alone = [hardware.quality(response, raw, gain_bits=bits, offset_bits=16) for bits in (8, 16)]
     assert [widths.added["gain"][bits] for bits in (8, 16)] == [each.added for each in alone]
 

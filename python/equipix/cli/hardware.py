@@ -143,9 +143,10 @@ def _cost(
     file: Path, correction: Correction, frames: list[str], options: dict[str, Any]
 ) -> tuple[dict[str, Any], Findings]:
     """Measure C of frames of each level by correction and table, and the widths that suffice."""
-    with naming_memory("measuring quality"):
+    with naming_memory("measuring quality"), terminal.working() as (progress, _):
+        shown = {"progress": progress}
         tried, said = zip(
-            *(_tried(file, correction, each, options) for each in frames), strict=True
+            *(_tried(file, correction, each, options | shown) for each in frames), strict=True
         )
     widths = widths_of([level.by_width for level in tried])
     costs = {
@@ -186,7 +187,7 @@ def _tried(
             f"{pattern}: holds one frame, expected two or more: each 'frames' names all of a "
             'level, as "level/*.tif" does'
         )
-    return trial(correction, np.stack([*raw]), **options), said
+    return trial(correction, np.stack([*raw]), stage=f"widths for {pattern}", **options), said
 
 
 def _cost_figures(cost: Cost) -> dict[str, float]:

@@ -6,12 +6,12 @@ import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import takewhile
+from itertools import count, takewhile
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from equipix._check import Array, ArrayLike, as_array, naming_memory, positive
+from equipix._check import Array, ArrayLike, Progress, as_array, naming_memory, positive
 from equipix.correction.protocol import Correction
 from equipix.errors import InputError, InputWarning
 from equipix.findings import usable
@@ -217,24 +217,38 @@ _SOUGHT = {"offset_bits", "gain_bits"}
 """Widths of which the smallest that suffice are sought."""
 
 
-def trial(correction: Correction, frames: ArrayLike, **options: Any) -> Trial:
+def trial(
+    correction: Correction,
+    frames: ArrayLike,
+    *,
+    progress: Progress | None = None,
+    stage: str = "",
+    **options: Any,
+) -> Trial:
     """Find `quality` at one level, and what `widths_of` needs of it, with one correction of it."""
     level = _Level.of("frames", correction, frames)
     found = _quality(level, correction, options)
     others = {name: value for name, value in options.items() if name not in _SOUGHT}
-    return Trial(found.planes, found.at_ends, _by_width(level, correction, others))
+    return Trial(found.planes, found.at_ends, _by_width(level, correction, others, progress, stage))
 
 
 def _by_width(
-    level: _Level, correction: Correction, options: dict[str, Any]
+    level: _Level,
+    correction: Correction,
+    options: dict[str, Any],
+    progress: Progress | None = None,
+    stage: str = "",
 ) -> dict[str, dict[int, tuple[float, str]]]:
     """Most that words of each width add at a level, and in which plane.
 
     Tables are made anew for each level: kept, they would take as much memory as 100 frames.
     """
+    total, done = 3 * len(_WIDTHS) - 2, count(1)  # 16 bits of both are tried once
 
     @cache
     def most(offset_bits: int, gain_bits: int) -> tuple[float, str]:
+        if progress is not None:
+            progress(next(done), total, stage)
         widths: dict[str, Any] = {"offset_bits": offset_bits, "gain_bits": gain_bits}
         try:
             table = Table.of(correction, **widths, **options)
