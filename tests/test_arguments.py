@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ RESPONSE = nuc.fit(LEVELS)
 ROWS, COLS = np.mgrid[: SHAPE[0], : SHAPE[1]]
 FLAT = 1000 * cos4((ROWS - 12.0) ** 2 + (COLS - 15.0) ** 2, 60.0)
 GAIN = lens.fit(FLAT).correction()
+SQUARED = dataclasses.replace(GAIN, coefficients=GAIN.coefficients**2)
 ARRAY = simulate.BolometerArray.of(SHAPE, rng=1)
 CELSIUS = [-20.0, 0.0, 20.0, 40.0, 60.0]
 SHUTTER = np.stack([ARRAY.mean(each) for each in CELSIUS])
@@ -63,7 +65,10 @@ CALLS = {
         "workers": None,
     },
     equipix.Corrector(RESPONSE).apply: {"frames": STACKS[1], "out": None},
-    equipix.combine: {"first": GAIN, "then": GAIN},
+    equipix.combine: {
+        "first": GAIN,
+        "then": dataclasses.replace(GAIN, coefficients=2 * GAIN.coefficients),
+    },
     equipix.Polynomial: {"coefficients": GAIN.coefficients, "flags": GAIN.flags},
     bolometer.fit: {
         "shutter": SHUTTER,
