@@ -65,10 +65,7 @@ CALLS = {
         "workers": None,
     },
     equipix.Corrector(RESPONSE).apply: {"frames": STACKS[1], "out": None},
-    equipix.combine: {
-        "first": GAIN,
-        "then": dataclasses.replace(GAIN, coefficients=2 * GAIN.coefficients),
-    },
+    equipix.combine: {"first": GAIN, "then": SQUARED},
     equipix.Polynomial: {"coefficients": GAIN.coefficients, "flags": GAIN.flags},
     bolometer.fit: {
         "shutter": SHUTTER,
