@@ -33,7 +33,7 @@ import numpy as np
 
 from equipix._check import Array, ArrayLike, Bools, Floats, Ints, number, positive
 from equipix.errors import InputError
-from equipix.measured.part import chosen, known_part
+from equipix.measured.part import blocks, chosen, known_part
 from equipix.shown import Brief
 
 MEDIAN_SQUARE = 0.4549
@@ -375,7 +375,8 @@ def modelled_variances(
     """
     variances = np.empty_like(like)
     for variance, model, signal in zip(variances, models, expected, strict=True):
-        variance[:] = model.variance(np.nan_to_num(signal))
+        for rows in blocks(signal.shape):
+            variance[rows] = model.variance(np.nan_to_num(signal[rows]))
         np.maximum(variance, _FLOOR * variance.max(), out=variance)
     return variances
 
