@@ -11,9 +11,10 @@ import equipix
 from equipix import simulate
 from equipix.exposures.exposures import FitOptions
 from equipix.findings import BITS, Flag
-from equipix.fitting.pixels import pixel_flags
+from equipix.fitting.pixels import _faint, pixel_flags
 from equipix.fitting.weighted import Options, Weighted, contradictory_found, weighted_fit
 from equipix.measured.defects import BadPixels
+from equipix.measured.part import known_part
 from given import exposures_of
 
 CROSS = equipix.cross_pattern(2, 3)
@@ -69,3 +70,18 @@ def test_most_measurements_left_out_contradict_each_other():
     assert fit.flags[4, 4] == BITS["contradictory"]
     assert np.argwhere(flags == BITS["contradictory"]).tolist() == [[4, 4]]
     assert np.count_nonzero(flags) == 1
+
+
+def test_a_bright_pixel_of_a_large_sensor_is_found_among_a_part():
+    # Sixteen sizes of pixel noise in 4x4 pixels, in light that falls to the edge.
+    rows, cols = np.indices((900, 1200))
+    std = 0.005 * (1 + (rows % 4 + cols % 4) / 20) * np.exp((rows / 900) ** 2 + (cols / 600) ** 2)
+    std[::7, ::5] = np.nan
+    bright = np.quantile(std[std <= 0.1], 0.1)
+    part = known_part(std)
+    # The share of the part below the quantile of all scatters as that of so many draws would.
+    share = np.mean(part[part <= 0.1] <= bright)
+    error = np.sqrt(0.1 * 0.9 / part.size)
+    assert abs(share - 0.1) < 3 * error
+    sure = np.abs(std / max(0.04, 4 * bright) - 1) > 0.01
+    assert ((_faint(std) == (std > max(0.04, 4 * bright))) | ~sure | np.isnan(std)).all()

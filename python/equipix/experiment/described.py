@@ -188,6 +188,7 @@ class Described(Brief, Generic[_Manifest]):
                 averaged.add(statistics, name, darks.shares[k] if darks.frames else None)
             except InputError as error:
                 raise FileError(f"{self.path}: {error}") from error
+            del statistics  # not beside those of the next one
         return averaged
 
     def _checked(self, mask: ArrayLike | None) -> tuple[Bools | None, dict[Path, str]]:

@@ -208,19 +208,15 @@ class Experiment(Described[Manifest]):
                 len(measured),
             )
             exposures = Exposures.of(measured, positions, fluxes, mask=excluded)
+        words = list(darks.words)
+        origin = self._provenance(hashes, averaged, exposures=names, darks=words)
+        del averaged, measured  # their variances are as large as the exposures
         if whole:
             exposures = exposures.at(positions.whole(std))
         elif self._is_moved():
             shifts, std = self._measured_again(exposures, moves, darks, options)
             exposures = exposures.at(Positions.of(shifts, rotation=positions.rotation, std=std))
-        origin = self._provenance(
-            hashes,
-            averaged,
-            exposures=names,
-            darks=list(darks.words),
-            measured_shifts=shifts.tolist(),
-            measured_shift_std=std.tolist(),
-        )
+        origin |= {"measured_shifts": shifts.tolist(), "measured_shift_std": std.tolist()}
         return calibrated(exposures, options, said=said, provenance=origin)
 
     def _measured_again(

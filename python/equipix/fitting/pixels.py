@@ -9,6 +9,7 @@ from equipix.fitting.outliers import weights_of
 from equipix.fitting.residuals import FEWEST, in_search
 from equipix.fitting.weighted import Options, Weighted
 from equipix.measured.defects import response_outliers
+from equipix.measured.part import known_part
 
 _CONTRADICTORY = 9.0
 """Mean squared residual of a pixel over the usual one from which its values contradict the fit. Of
@@ -144,8 +145,12 @@ def without_faint_pixels(weighted: Weighted, options: Options) -> Weighted:
 
 
 def _faint(std: Array) -> Bools:
-    """Pixels known to worse than 4 %, and four times worse than a bright one, as in `prior.rs`."""
-    known = std[np.isfinite(std)]
+    """Pixels known to worse than 4 %, and four times worse than a bright one, as in `prior.rs`.
+
+    The bright one is found among 2¹⁹ pixels, evenly over the sensor, where there are more.
+    """
+    known = known_part(std)
+    known = known[np.isfinite(known)]
     lit = known[known <= _LIT]
     lit = lit if lit.size >= _FEWEST else known
     if not lit.size:

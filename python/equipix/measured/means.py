@@ -230,10 +230,7 @@ class Averaged:
         """Points of the photon-transfer curve of each dark, at signal 0."""
         free = (each.saturated == 0 for each in self.darks)
         pairs = zip(self.darks, free, strict=True)
-        return [
-            _points(d, np.broadcast_to(0.0, d.mean.shape), usable, light_of(d))
-            for d, usable in pairs
-        ]
+        return [_points(d, np.zeros(d.mean.shape), usable, light_of(d)) for d, usable in pairs]
 
     @cached_property
     def _beside_least(self) -> list[float]:

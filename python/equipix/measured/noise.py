@@ -33,7 +33,7 @@ import numpy as np
 
 from equipix._check import Array, ArrayLike, Bools, Floats, Ints, number, positive
 from equipix.errors import InputError
-from equipix.measured.part import chosen, known_part
+from equipix.measured.part import blocks, chosen, known_part
 from equipix.shown import Brief
 
 MEDIAN_SQUARE = 0.4549
@@ -341,26 +341,26 @@ def _of_neighbours(image: Array, usable: Bools, pixels: Ints, period: tuple[int,
     Neighbours are a period away; pixels are flat indices.
     """
     down, right = period
-    place = np.divmod(pixels, image.shape[1])
-    lines = [_of_line(image, usable, place, down, step) for step in (-right, 0, right)]
-    itself = usable[place]
+    lines = [_of_line(image, usable, pixels, down, step) for step in (-right, 0, right)]
+    itself = usable.take(pixels)
     total, count = (sum(each) for each in zip(*lines, strict=True))
-    total -= np.where(itself, image[place], 0.0)
+    total -= np.where(itself, image.take(pixels), 0.0)
     with np.errstate(invalid="ignore"):
         return np.asarray(total / (count - itself))
 
 
 def _of_line(
-    image: Array, usable: Bools, place: tuple[Ints, Ints], down: int, right: int
+    image: Array, usable: Bools, pixels: Ints, down: int, right: int
 ) -> tuple[Array, Array]:
-    """Sum and number of three usable pixels in a column: above, beside and below each place."""
-    total, count = np.zeros((2, place[0].size))
+    """Sum and number of three usable pixels in a column: above, beside and below each pixel."""
+    total, count = np.zeros((2, pixels.size))
+    col = pixels % image.shape[1] + right
+    in_row = (col >= 0) & (col < image.shape[1])
     for step in (-down, 0, down):
-        row, col = place[0] + step, place[1] + right
-        inside = (row >= 0) & (row < image.shape[0]) & (col >= 0) & (col < image.shape[1])
-        at = np.where(inside, row, 0), np.where(inside, col, 0)
-        counted = inside & usable[at]
-        total += np.where(counted, image[at], 0.0)
+        at = pixels + (step * image.shape[1] + right)
+        counted = in_row & (at >= 0) & (at < image.size)
+        counted &= usable.take(at, mode="clip")
+        total += np.where(counted, image.take(at, mode="clip"), 0.0)
         count += counted
     return total, count
 
@@ -375,7 +375,8 @@ def modelled_variances(
     """
     variances = np.empty_like(like)
     for variance, model, signal in zip(variances, models, expected, strict=True):
-        variance[:] = model.variance(np.nan_to_num(signal))
+        for rows in blocks(signal.shape):
+            variance[rows] = model.variance(np.nan_to_num(signal[rows]))
         np.maximum(variance, _FLOOR * variance.max(), out=variance)
     return variances
 

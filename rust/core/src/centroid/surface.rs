@@ -41,6 +41,12 @@ pub(super) fn terms([r, c]: [f64; 2]) -> Terms {
     [1.0, r, c, rr, rc, cc, rr * r, rr * c, r * cc, cc * c]
 }
 
+/// The factors of 1, c, c², c³ that a surface has in the row r.
+pub(super) fn along_row(k: &Terms, r: f64) -> [f64; 4] {
+    let zeroth = ((k[6] * r + k[3]) * r + k[1]) * r + k[0];
+    [zeroth, (k[7] * r + k[4]) * r + k[2], k[8] * r + k[5], k[9]]
+}
+
 pub(super) fn dot(a: &Terms, b: &Terms) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
@@ -136,6 +142,17 @@ mod tests {
         assert_eq!(median(&mut [4.0, 1.0, 2.0, 3.0]), 2.5);
         assert!(median(&mut []).is_nan());
         assert_eq!(robust_deviation(&mut [-1.0, 0.0, 1.0, 1e9, 0.5]), 0.5 * NORMAL_MAD);
+    }
+
+    #[test]
+    fn a_row_of_a_surface_is_a_cubic() {
+        let surface = [100.0, 3.0, -2.0, -20.0, 1.0, -15.0, 2.0, -4.0, 1.0, 3.0];
+        for (r, c) in [(0.3, -0.7), (-1.0, 1.0), (0.9, 0.2)] {
+            let row = along_row(&surface, r);
+            let got = row.iter().rev().fold(0.0, |sum, factor| sum * c + factor);
+            // Twenty roundings of values up to 200.
+            assert!((got - dot(&surface, &terms([r, c]))).abs() < 20.0 * 200.0 * f64::EPSILON);
+        }
     }
 
     #[test]
