@@ -5,10 +5,9 @@
 //! penalty acts on what differs from the beam's multiples, in the metric of its weights D:
 //! P x = x − a (aᵀD x)/(aᵀD a); otherwise it would pull the beam to 0 and M up.
 
-use crate::coarse::Value;
 use crate::control::Control;
 use crate::frames::Shape;
-use crate::parallel::Workers;
+use crate::parallel::{Value, Workers};
 
 /// The weight τ of the penalty, as a share of the mean weight of a cell.
 pub const SMOOTHING: f64 = 1e-5;
