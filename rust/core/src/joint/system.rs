@@ -219,7 +219,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled), here and below.
     pub(crate) fn linearise(&mut self, control: &Control) -> Result<(f64, Vec<f64>)> {
-        self.pass.place(&self.state.shifts, control);
+        self.pass.place(&self.state.shifts);
         // Its bands are those of the shifts.
         self.fused.take_if(|_| self.shift_prior.is_some());
         (self.is_fused_anew, self.is_weighed_anew) = (false, false);
@@ -432,6 +432,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         let fused =
             self.fused.get_or_insert_with(|| Fused::new(&self.pass, self.ordinary, control));
         if !self.is_fused_anew {
+            self.pass.free_sums();
             fused.renew(&self.pass, control);
             control.check()?;
             self.is_fused_anew = true;
