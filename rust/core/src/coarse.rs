@@ -23,7 +23,6 @@ mod spectrum;
 pub(crate) use hats::Hats;
 pub(crate) use matrix::{Coarse, Entry};
 pub(crate) use modulated::Modulated;
-pub(crate) use modulated_kernel::Value;
 pub(crate) use modulated_matrix::{SeenWave, Spot};
 pub(crate) use spacing::{DAMPING, bytes_needed, spacing, spacing_of_waves};
 pub(crate) use spectrum::{Complex, MOST_WAVES, Symbol, barely_constrained, times};

@@ -44,7 +44,7 @@ mod weak_light;
 mod wide;
 mod workspace;
 
-pub(crate) use conjugate_gradients::ConjugateGradients;
+pub(crate) use conjugate_gradients::{ConjugateGradients, Known};
 pub(crate) use first_beam::{Source, first_beam};
 pub(crate) use flux::Fluxes;
 pub(crate) use kernel::{Propagate, Row};
@@ -55,6 +55,6 @@ pub(crate) use pass::Pass;
 pub use penalty::SMOOTHING;
 pub(crate) use preconditioner::Preconditioner;
 pub(crate) use shift_information::Directions;
-pub(crate) use system::System;
+pub(crate) use system::{Precision, System};
 pub(crate) use unknowns::{Prior, ShiftPrior, State};
 pub(crate) use workspace::Workspace;

@@ -5,6 +5,7 @@
 
 use std::collections::HashMap;
 use std::num::NonZeroUsize;
+use std::ops;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -16,14 +17,43 @@ use crate::error::{Error, Result};
 /// Values that a thread writes between two looks at whether to stop.
 const FILLED: usize = 1 << 16;
 
-/// a · b, in several sums side by side, which vector registers hold.
-pub(crate) fn dot(a: &[f64], b: &[f64]) -> f64 {
+/// Numbers of single or double precision.
+pub(crate) trait Value:
+    Copy
+    + Default
+    + Send
+    + Sync
+    + ops::Add<Output = Self>
+    + ops::Sub<Output = Self>
+    + ops::Mul<Output = Self>
+    + ops::AddAssign
+    + Into<f64>
+{
+    fn of(value: f64) -> Self;
+}
+
+impl Value for f32 {
+    #[inline(always)]
+    fn of(value: f64) -> Self {
+        value as Self
+    }
+}
+
+impl Value for f64 {
+    #[inline(always)]
+    fn of(value: f64) -> Self {
+        value
+    }
+}
+
+/// a · b in double precision, in several sums side by side, which vector registers hold.
+pub(crate) fn dot<A: Value, B: Value>(a: &[A], b: &[B]) -> f64 {
     pulp::Arch::new().dispatch(Dot(a, b))
 }
 
-struct Dot<'s>(&'s [f64], &'s [f64]);
+struct Dot<'s, A, B>(&'s [A], &'s [B]);
 
-impl pulp::NullaryFnOnce for Dot<'_> {
+impl<A: Value, B: Value> pulp::NullaryFnOnce for Dot<'_, A, B> {
     type Output = f64;
 
     #[inline(always)]
@@ -33,34 +63,34 @@ impl pulp::NullaryFnOnce for Dot<'_> {
         let mut sums = [0.0; LANES];
         for (a, b) in a.iter().zip(b) {
             for i in 0..LANES {
-                sums[i] += a[i] * b[i];
+                sums[i] += Into::<f64>::into(a[i]) * b[i].into();
             }
         }
-        let rest: f64 = rest_a.iter().zip(rest_b).map(|(a, b)| a * b).sum();
-        sums.iter().sum::<f64>() + rest
+        let rest = rest_a.iter().zip(rest_b).map(|(&a, &b)| Into::<f64>::into(a) * b.into());
+        sums.iter().sum::<f64>() + rest.sum::<f64>()
     }
 }
 
-/// sums += f · values.
-pub(crate) struct Add<'s> {
+/// sums += f · values, in double precision.
+pub(crate) struct Add<'s, V, S> {
     pub(crate) factor: f64,
-    pub(crate) values: &'s [f64],
-    pub(crate) sums: &'s mut [f64],
+    pub(crate) values: &'s [V],
+    pub(crate) sums: &'s mut [S],
 }
 
-impl Add<'_> {
+impl<V: Value, S: Value> Add<'_, V, S> {
     pub(crate) fn dispatch(self) {
         pulp::Arch::new().dispatch(self);
     }
 }
 
-impl pulp::NullaryFnOnce for Add<'_> {
+impl<V: Value, S: Value> pulp::NullaryFnOnce for Add<'_, V, S> {
     type Output = ();
 
     #[inline(always)]
     fn call(self) {
-        for (sum, value) in self.sums.iter_mut().zip(self.values) {
-            *sum += self.factor * value;
+        for (sum, &value) in self.sums.iter_mut().zip(self.values) {
+            *sum = S::of(Into::<f64>::into(*sum) + self.factor * value.into());
         }
     }
 }
@@ -188,7 +218,7 @@ impl Workers {
     }
 
     /// a · b.
-    pub(crate) fn dot(&self, a: &[f64], b: &[f64]) -> f64 {
+    pub(crate) fn dot<A: Value, B: Value>(&self, a: &[A], b: &[B]) -> f64 {
         let blocks: Vec<_> = a.chunks(FILLED).zip(b.chunks(FILLED)).collect();
         let sums = self.map(blocks.len(), |index| {
             let (a, b) = blocks[index];
@@ -198,7 +228,7 @@ impl Workers {
     }
 
     /// y ← y + f x.
-    pub(crate) fn add_multiple(&self, y: &mut [f64], factor: f64, x: &[f64]) {
+    pub(crate) fn add_multiple<Y: Value, X: Value>(&self, y: &mut [Y], factor: f64, x: &[X]) {
         self.map_blocks(y, FILLED, |index, sums| {
             Add { factor, values: &x[index * FILLED..], sums }.dispatch();
         });

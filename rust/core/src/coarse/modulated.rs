@@ -14,12 +14,12 @@
 use std::ops::Range;
 
 use super::hats::Hats;
-use super::modulated_kernel::{Accumulate, Close, Columns, Distribute, Open, Value};
+use super::modulated_kernel::{Accumulate, Close, Columns, Distribute, Open};
 use super::modulated_matrix::{Matrix, SeenWave, Spot};
 use super::spacing::DAMPING;
 use super::spectrum::Wave;
 use crate::linalg::Cholesky;
-use crate::parallel::Workers;
+use crate::parallel::{Value, Workers};
 
 /// The coarse space of some waves.
 pub(crate) struct Modulated<N> {

@@ -1,36 +1,9 @@
 //! The arithmetic of hats times waves, inlined into code for the CPU at hand.
 
-use std::ops::{Add, AddAssign, Mul, Sub};
+use crate::parallel::Value;
 
 /// Values side by side, which vector registers hold.
 const LANES: usize = 16;
-
-/// Numbers of single or double precision.
-pub(crate) trait Value:
-    Copy
-    + Default
-    + Send
-    + Sync
-    + Add<Output = Self>
-    + Sub<Output = Self>
-    + Mul<Output = Self>
-    + AddAssign
-    + Into<f64>
-{
-    fn of(value: f64) -> Self;
-}
-
-impl Value for f32 {
-    fn of(value: f64) -> Self {
-        value as Self
-    }
-}
-
-impl Value for f64 {
-    fn of(value: f64) -> Self {
-        value
-    }
-}
 
 /// Sums over rows: lines(i, col) = Σ_row f(row, i) values(row, col), for four lines.
 pub(super) struct Accumulate<'s, N> {

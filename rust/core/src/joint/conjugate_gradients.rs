@@ -1,34 +1,51 @@
-//! Conjugate gradients for the joint problem S x = b, in double precision.
+//! Conjugate gradients for the joint problem S x = b, its vectors in single or double precision.
 
 use super::preconditioner::Preconditioner;
-use super::system::System;
+use super::system::{Precision, System};
 use crate::coarse::DAMPING;
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
 use crate::ritz::{Lowest, Ritz};
 
-/// A solution in the making.
+/// What searches so far have told of P⁻¹S.
+#[derive(Clone)]
+pub(crate) struct Known {
+    /// The smallest Ritz value of all; at first the eigenvalue of smooth errors.
+    pub(crate) lowest: Lowest,
+    pub(crate) iterations: u64,
+}
+
+impl Default for Known {
+    fn default() -> Self {
+        Self { lowest: Lowest::new(DAMPING), iterations: 0 }
+    }
+}
+
+/// A solution in the making, in the units of its numbers ([`Precision::units`]).
 #[derive(Default)]
-pub(crate) struct ConjugateGradients {
-    pub(crate) x: Vec<f64>,
-    residual: Vec<f64>,
-    direction: Vec<f64>,
+pub(crate) struct ConjugateGradients<N> {
+    pub(crate) x: Vec<N>,
+    residual: Vec<N>,
+    direction: Vec<N>,
     /// S times the direction, then P⁻¹ r.
-    product: Vec<f64>,
+    product: Vec<N>,
     pub(crate) square: f64,
     keep: f64,
     /// x · b, of which b − S x lacks some.
     pub(crate) energy: f64,
     ritz: Ritz,
-    /// The smallest Ritz value of all searches; at first the eigenvalue of smooth errors.
-    pub(crate) lowest: Lowest,
-    pub(crate) iterations: u64,
+    pub(crate) known: Known,
     /// Whether the preconditioner does.
     sees_large_scales: bool,
 }
 
-impl ConjugateGradients {
+impl<N: Precision> ConjugateGradients<N> {
+    /// After searches that have told so much.
+    pub(crate) fn after(known: Known) -> Self {
+        Self { known, ..Self::default() }
+    }
+
     pub(crate) fn begin<T: Real>(
         &mut self,
         system: &System<'_, '_, T>,
@@ -36,19 +53,17 @@ impl ConjugateGradients {
         slope: Vec<f64>,
         control: &Control,
     ) -> Result<()> {
-        if self.iterations == 0 {
-            self.lowest = Lowest::new(DAMPING);
-        }
         self.sees_large_scales = preconditioner.sees_large_scales();
-        let zeros = || system.pass.workers.filled(slope.len(), 0.0, control);
+        let zeros = || system.pass.workers.filled(slope.len(), N::default(), control);
         self.x = zeros();
         if self.direction.len() != slope.len() {
             (self.direction, self.product) = (zeros(), zeros());
         }
         control.check()?;
-        preconditioner.apply(system, &slope, &mut self.direction, control)?;
-        self.square = system.pass.workers.dot(&slope, &self.direction);
-        self.residual = slope;
+        let [_, unit] = system.units::<N>();
+        self.residual = slope.into_iter().map(|slope| N::of(slope / unit)).collect();
+        preconditioner.apply(system, &self.residual, &mut self.direction, control)?;
+        self.square = system.pass.workers.dot(&self.residual, &self.direction);
         self.keep = 0.0;
         self.energy = 0.0;
         self.ritz = Ritz::default();
@@ -96,8 +111,8 @@ impl ConjugateGradients {
         std::mem::swap(&mut self.direction, &mut self.product);
         self.ritz.push(step, self.keep);
         self.square = square;
-        self.lowest.push(self.ritz.smallest());
-        self.iterations += 1;
+        self.known.lowest.push(self.ritz.smallest());
+        self.known.iterations += 1;
         Ok(square > 0.0)
     }
 }

@@ -13,7 +13,7 @@
 //! each step, which makes good what the one before left by rounding (iterative refinement).
 
 use super::bands::Bands;
-use super::fused_kernel::{Along, Back, Eliminate, LANES, Lengthen, Pixels, Ring, Shorten, Sum};
+use super::fused_kernel::{Along, Back, Eliminate, LANES, Pixels, Ring, Subtract, Sum};
 use super::kernel::{AROUND, Row};
 use super::pass::Pass;
 use super::penalty::Penalty;
@@ -26,9 +26,8 @@ use crate::geometry::{Rotation, TAPS};
 const BAND: usize = 64;
 /// Rows of cells that a thread folds at a time.
 const FOLDED: usize = 32;
-/// Rows of pixels, and cells, that a thread converts at a time.
-const CONVERTED_ROWS: usize = 16;
-const CONVERTED: usize = 1 << 14;
+/// Rows of pixels that a thread converts at a time.
+const CONVERTED: usize = 16;
 
 /// What a fused product needs of one linearisation.
 pub(super) struct Fused {
@@ -44,8 +43,7 @@ pub(super) struct Fused {
     /// An ordinary light, and w₀.
     light: f64,
     weight: f64,
-    /// x in units of that light, and the sums of all bands.
-    x: Vec<f32>,
+    /// The sums of all bands.
     sums: Vec<f32>,
 }
 
@@ -59,7 +57,11 @@ impl Fused {
     }
 
     /// For exposures at the places where the pass has them.
-    pub(super) fn new<T: Real>(pass: &Pass<'_, '_, T>, control: &Control) -> Self {
+    pub(super) fn new<T: Real>(
+        pass: &Pass<'_, '_, T>,
+        [light, weight]: [f64; 2],
+        control: &Control,
+    ) -> Self {
         let (sensor, count) = (pass.exposures.sensor(), pass.exposures.count());
         let bands = Bands::new(&pass.windows, &pass.grid.geometry.views, pass.grid.width, BAND);
         let width = sensor.cols.next_multiple_of(LANES);
@@ -72,9 +74,8 @@ impl Fused {
             is_uneven,
             rows: pass.workers.filled(sensor.rows * length, 0.0, control),
             taps: [Vec::new(), Vec::new()],
-            light: pass.exposures.typical_light(),
-            weight: pass.exposures.typical_weight(),
-            x: pass.workers.filled(pass.grid.geometry.beam.len(), 0.0, control),
+            light,
+            weight,
             sums,
         }
     }
@@ -92,13 +93,13 @@ impl Fused {
         let across = |k: usize| pass.windows[k].along_cols.values.map(|tap| tap as f32);
         self.taps = [(0..count).map(along).collect(), (0..count).map(across).collect()];
         let length = self.length(count);
-        pass.workers.map_blocks(&mut self.rows, CONVERTED_ROWS * length, |block, rows| {
+        pass.workers.map_blocks(&mut self.rows, CONVERTED * length, |block, rows| {
             let mut workspace = pass.workspace();
             for (index, row) in rows.chunks_exact_mut(length).enumerate() {
                 if control.is_cancelled() {
                     return;
                 }
-                let index = block * CONVERTED_ROWS + index;
+                let index = block * CONVERTED + index;
                 pass.weigh_row(index, &mut workspace);
                 let (lights, rest) = pass.row(index).split_at(count * cols);
                 let (m, inverse) = rest.split_at(cols);
@@ -117,18 +118,17 @@ impl Fused {
         (if self.is_uneven { 2 * count } else { count } + 2) * self.width
     }
 
-    /// S x, and the change of M in each [`Row`]; returns the largest size of that less `share` of the
-    /// change before.
+    /// S x in units of w₀ times an ordinary light, for x in units of that light, and the change of M in each
+    /// [`Row`]; returns the largest size of that less `share` of the change before.
     pub(super) fn multiply<T: Real>(
         &mut self,
         pass: &mut Pass<'_, '_, T>,
         penalty: &Penalty,
-        x: &[f64],
+        x: &[f32],
         share: f64,
-        product: &mut [f64],
+        product: &mut [f32],
         control: &Control,
     ) -> Result<f64> {
-        let multiples = self.shorten(pass, penalty, x);
         let count = pass.exposures.count();
         let of_row = Row::length(count, pass.exposures.sensor().cols, pass.with_offset);
         let mut rows = std::mem::take(&mut pass.rows);
@@ -137,38 +137,21 @@ impl Fused {
         let sizes = [fused.bands.height * of_row, fused.bands.length];
         let bands = pass.workers.map_pairs(&mut rows, &mut sums, sizes, |band, rows, strips| {
             let rows = rows.chunks_exact_mut(of_row);
-            fused.band(seen, band, rows, share, strips, control)
+            fused.band(seen, x, band, rows, share, strips, control)
         });
         (pass.rows, self.sums) = (rows, sums);
         pass.count += 1;
         control.check()?;
-        self.fold(pass, penalty, multiples, product);
+        self.fold(pass, penalty, x, product);
         control.check()?;
         Ok(bands.into_iter().fold(0.0, f64::max))
-    }
-
-    /// Writes x in single precision; returns what multiples of the beam's pulls the penalty takes off.
-    fn shorten<T: Real>(
-        &mut self,
-        pass: &Pass<'_, '_, T>,
-        penalty: &Penalty,
-        x: &[f64],
-    ) -> [f64; 2] {
-        let scale = self.light;
-        let sums = pass.workers.map_blocks(&mut self.x, CONVERTED, |index, short| {
-            let first = index * CONVERTED;
-            let x = &x[first..first + short.len()];
-            let others = [&penalty.pull[first..], &penalty.bent[first..]];
-            pulp::Arch::new().dispatch(Shorten { x, scale, others, short })
-        });
-        let [pull, bent] = [0, 1].map(|i| sums.iter().map(|sums| sums[i]).sum::<f64>());
-        penalty.multiples(pull, bent)
     }
 
     /// What the pixels of one band pull at the cells.
     fn band<'r, T: Real>(
         &self,
         pass: &Pass<'_, '_, T>,
+        x: &[f32],
         band: usize,
         rows: impl ExactSizeIterator<Item = &'r mut [f64]>,
         share: f64,
@@ -187,7 +170,7 @@ impl Fused {
         let look = |seen: &mut Ring, row: usize| {
             for (k, window) in pass.windows.iter().enumerate() {
                 let at = (first + row + window.row) * stride + window.col;
-                let (values, taps) = (&self.x[at..][..cols + AROUND], self.taps[1][k]);
+                let (values, taps) = (&x[at..][..cols + AROUND], self.taps[1][k]);
                 let seen = &mut seen.row_mut(k, row)[..cols];
                 pulp::Arch::new().dispatch(Along { values, taps, seen });
             }
@@ -252,23 +235,24 @@ impl Fused {
         &self,
         pass: &Pass<'_, '_, T>,
         penalty: &Penalty,
-        multiples: [f64; 2],
-        product: &mut [f64],
+        x: &[f32],
+        product: &mut [f32],
     ) {
-        let cols = pass.grid.geometry.beam.cols;
-        let (factor, bends) = (self.weight * self.light, (penalty.tau / self.weight) as f32);
-        pass.workers.map_blocks(product, FOLDED * cols, |block, product| {
+        let (cols, workers) = (pass.grid.geometry.beam.cols, pass.workers);
+        let (pulled, bent) = (workers.dot(&penalty.pull, x), workers.dot(&penalty.bent, x));
+        let multiples = penalty.multiples(pulled, bent).map(|multiple| multiple / self.weight);
+        let bends = (penalty.tau / self.weight) as f32;
+        workers.map_blocks(product, FOLDED * cols, |block, product| {
             let first = block * FOLDED;
-            let mut sums = vec![0.0; product.len()];
-            for (row, sums) in sums.chunks_exact_mut(cols).enumerate() {
+            product.fill(0.0);
+            for (row, sums) in product.chunks_exact_mut(cols).enumerate() {
                 for values in self.bands.seeing(&self.sums, 0, first + row) {
                     pulp::Arch::new().dispatch(Sum(values, sums));
                 }
             }
-            penalty.bend_rows(&self.x, bends, first, &mut sums);
+            penalty.bend_rows(x, bends, first, product);
             let others = [&penalty.bent[first * cols..], &penalty.pull[first * cols..]];
-            let sums = &sums[..];
-            pulp::Arch::new().dispatch(Lengthen { sums, factor, others, multiples, product });
+            pulp::Arch::new().dispatch(Subtract { others, multiples, product });
         });
     }
 }

@@ -174,53 +174,22 @@ impl pulp::NullaryFnOnce for Back<'_> {
     }
 }
 
-/// x in single precision, in units of `scale`; returns its products with two others.
-pub(super) struct Shorten<'s> {
-    pub(super) x: &'s [f64],
-    pub(super) scale: f64,
-    pub(super) others: [&'s [f64]; 2],
-    pub(super) short: &'s mut [f32],
-}
-
-impl pulp::NullaryFnOnce for Shorten<'_> {
-    type Output = [f64; 2];
-
-    #[inline(always)]
-    fn call(self) -> [f64; 2] {
-        let [a, b] = self.others.map(|other| &other[..self.x.len()]);
-        let mut sums = [[0.0; LANES]; 2];
-        let chunks = self.short.chunks_mut(LANES).zip(self.x.chunks(LANES));
-        let chunks = chunks.zip(a.chunks(LANES)).zip(b.chunks(LANES));
-        for (((short, x), a), b) in chunks {
-            for i in 0..x.len() {
-                short[i] = (x[i] / self.scale) as f32;
-                sums[0][i] += x[i] * a[i];
-                sums[1][i] += x[i] * b[i];
-            }
-        }
-        sums.map(|sums| sums.into_iter().sum())
-    }
-}
-
-/// Sums of single precision in double, times a factor, less multiples of two others.
-pub(super) struct Lengthen<'s> {
-    pub(super) sums: &'s [f32],
-    pub(super) factor: f64,
+/// Takes multiples of two others off.
+pub(super) struct Subtract<'s> {
     pub(super) others: [&'s [f64]; 2],
     pub(super) multiples: [f64; 2],
-    pub(super) product: &'s mut [f64],
+    pub(super) product: &'s mut [f32],
 }
 
-impl pulp::NullaryFnOnce for Lengthen<'_> {
+impl pulp::NullaryFnOnce for Subtract<'_> {
     type Output = ();
 
     #[inline(always)]
     fn call(self) {
         let [s, t] = self.multiples;
         let [a, b] = self.others;
-        let terms = self.sums.iter().zip(a).zip(b);
-        for (product, ((sum, a), b)) in self.product.iter_mut().zip(terms) {
-            *product = self.factor * f64::from(*sum) - s * a - t * b;
+        for (product, (a, b)) in self.product.iter_mut().zip(a.iter().zip(b)) {
+            *product = (f64::from(*product) - s * a - t * b) as f32;
         }
     }
 }

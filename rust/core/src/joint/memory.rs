@@ -12,7 +12,7 @@ use crate::frames::Real;
 /// | the light of each measurement, and for products in single precision a unit and a gain | 8 + 4 + 4 |
 /// | M, its normal matrix, its change; O and two more elements; M² and a factor in single precision | 32 or 48 for each pixel |
 /// | the sums of all bands (`pass.rs`, `fused.rs`) | 12 · 2.2 at most for each cell of each view |
-/// | the beam, seven vectors of a search, weights, the penalty, the preconditioner, slopes, the last step and its slope | 8 · 21 for each cell |
+/// | the beam, four vectors of a search, weights, the penalty, the preconditioner, slopes, the last step and its slope | 8 · 17 for each cell |
 /// | with turned exposures, the beam and a vector in each view, and what was found there | 24 for each cell of each view |
 /// | the rim and its factor | some 2000 for each of its cells, [`WIDEST`] of each row and column at most |
 /// | the result and its components | 30 for each pixel, 21 for each cell |
@@ -24,7 +24,7 @@ pub(crate) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>) -> u64 {
     let turned = if views > 1 { 24 * views } else { 0 };
     let rim = 2000 * WIDEST as u64 * (geometry.beam.rows + geometry.beam.cols) as u64;
     of_pixel * pixels
-        + (27 * views + turned + 193) * cells
+        + (27 * views + turned + 161) * cells
         + rim
         + coarse::bytes_needed(geometry, MOST_WAVES)
 }

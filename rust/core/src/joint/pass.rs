@@ -85,16 +85,16 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
         }
     }
 
-    /// Where the exposures lie, and the sums that this takes.
-    pub(crate) fn place(&mut self, shifts: &[[f64; 2]], control: &Control) {
-        let Grid { geometry, width, sensor, .. } = &self.grid;
+    /// Where the exposures lie.
+    pub(crate) fn place(&mut self, shifts: &[[f64; 2]]) {
+        let Grid { geometry, width, .. } = &self.grid;
         self.windows = self.grid.windows(shifts);
         self.bands = Bands::new(&self.windows, &geometry.views, *width, FEWEST_ROWS);
-        let size = self.bands.size(sensor.rows);
-        if self.sums.len() != size {
-            self.sums = Vec::new();
-            self.sums = self.workers.filled(size, 0.0, control);
-        }
+    }
+
+    /// Frees the sums of bands, until the next pass.
+    pub(crate) fn free_sums(&mut self) {
+        self.sums = Vec::new();
     }
 
     /// Calls `work` for each row of pixels, which leaves the pull of each exposure in the workspace's values,
@@ -109,6 +109,11 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
         let length = Row::length(count, sensor.cols, self.with_offset);
         let mut rows = std::mem::take(&mut self.rows);
         let mut sums = std::mem::take(&mut self.sums);
+        let size = self.bands.size(sensor.rows);
+        if sums.len() != size {
+            drop(sums);
+            sums = self.workers.filled(size, 0.0, control);
+        }
         let (pass, height) = (&*self, self.bands.height);
         let sizes = [height * length, self.bands.length];
         let bands = pass.workers.map_pairs(&mut rows, &mut sums, sizes, |band, rows, strips| {

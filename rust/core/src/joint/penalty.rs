@@ -5,10 +5,9 @@
 //! penalty acts on what differs from the beam's multiples, in the metric of its weights D:
 //! P x = x − a (aᵀD x)/(aᵀD a); otherwise it would pull the beam to 0 and M up.
 
-use crate::coarse::Value;
 use crate::control::Control;
 use crate::frames::Shape;
-use crate::parallel::Workers;
+use crate::parallel::{Value, Workers};
 
 /// The weight τ of the penalty, as a share of the mean weight of a cell.
 pub const SMOOTHING: f64 = 1e-5;
@@ -25,7 +24,7 @@ pub(crate) struct Penalty {
     shape: Shape,
     pub(crate) tau: f64,
     /// 1 where the five cells from here on count, down a column and along a row; else 0.
-    counted: [Vec<f32>; 2],
+    counted: [Vec<u8>; 2],
     /// D a and aᵀ D a.
     pub(super) pull: Vec<f64>,
     norm: f64,
@@ -46,7 +45,7 @@ impl Penalty {
         let Shape { rows, cols } = shape;
         let zeros = || workers.filled(shape.len(), 0.0, control);
         let count = |width: usize, height: usize, step: usize| {
-            let mut counted = workers.filled(shape.len(), 0.0, control);
+            let mut counted = workers.filled(shape.len(), 0, control);
             workers.map_blocks(&mut counted, cols, |row, counted| {
                 if row >= height || width == 0 {
                     return;
@@ -68,7 +67,7 @@ impl Penalty {
         for (own, other) in self.counted.iter_mut().zip(&other.counted) {
             for (own, other) in own.iter_mut().zip(other) {
                 grows |= *own > *other;
-                *own = own.max(*other);
+                *own = (*own).max(*other);
             }
         }
         grows
@@ -129,7 +128,7 @@ impl Penalty {
     ) {
         let mut drawn = vec![0.0; beam.len()];
         for (counted, step) in self.counted.iter().zip([self.shape.cols, 1]) {
-            for first in (0..counted.len()).filter(|&first| counted[first] > 0.0) {
+            for first in (0..counted.len()).filter(|&first| counted[first] > 0) {
                 let sign = sign();
                 for (i, factor) in FOURTH.iter().enumerate() {
                     drawn[first + i * step] += sign * factor;
@@ -147,7 +146,7 @@ impl Penalty {
         for (counted, step) in self.counted.iter().zip([self.shape.cols, 1]) {
             for (i, own) in FOURTH.iter().enumerate() {
                 let Some(first) = cell.checked_sub(i * step) else { continue };
-                if counted[first] > 0.0 {
+                if counted[first] > 0 {
                     for (j, other) in FOURTH.iter().enumerate() {
                         visit(first + j * step, self.tau * own * other);
                     }
@@ -199,7 +198,7 @@ impl Penalty {
 /// Whether all five weights are above 0.
 struct Count<'s> {
     weights: [&'s [f64]; 5],
-    counted: &'s mut [f32],
+    counted: &'s mut [u8],
 }
 
 impl pulp::NullaryFnOnce for Count<'_> {
@@ -211,7 +210,7 @@ impl pulp::NullaryFnOnce for Count<'_> {
         let weights = a.iter().zip(b).zip(c).zip(d).zip(e);
         for (counted, ((((a, b), c), d), e)) in self.counted.iter_mut().zip(weights) {
             let least = a.min(b.min(*c)).min(d.min(*e));
-            *counted = if least > 0.0 { 1.0 } else { 0.0 };
+            *counted = u8::from(least > 0.0);
         }
     }
 }
@@ -219,7 +218,7 @@ impl pulp::NullaryFnOnce for Count<'_> {
 /// Fourth differences, where they count.
 struct Differ<'s, N> {
     values: [&'s [N]; 5],
-    counted: &'s [f32],
+    counted: &'s [u8],
     sums: &'s mut [N],
 }
 

@@ -13,13 +13,14 @@
 
 use super::rim::Rim;
 use super::survey::Block;
-use super::system::System;
+use super::system::{Precision, System};
 use super::waves::Waves;
 use super::wide::Wide;
 use crate::coarse::{Coarse, DAMPING, Entry, Hats, spacing};
 use crate::control::Control;
 use crate::error::Result;
-use crate::frames::Real;
+use crate::frames::{Real, Shape};
+use crate::parallel::Value;
 
 /// Blocks of pixels along the distance of two hats.
 const BLOCKS: usize = 3;
@@ -29,13 +30,18 @@ const BAND: usize = 32;
 const FAINTEST: f64 = 1e-12;
 /// K along an axis, 1 + t/8 + 2t²/25 with t = 2 − 2 cos q: 2.8 at the finest pattern where the inverse of
 /// 1/6, 4/6, 1/6 is 3.
-const FILTER: [f64; 5] = [0.08, -0.445, 1.73, -0.445, 0.08];
+const FILTER: [f32; 5] = [0.08, -0.445, 1.73, -0.445, 0.08];
 
+/// What is left of 1/D so many cells away from the rim: nothing on it, and less beside it, since a filter that is
+/// cut off takes fine patterns there for three times what they are.
+const FROM_RIM: [f32; 3] = [0.0, 0.5, 0.7];
+
+/// Its arrays are in single precision, in units of an ordinary light and weight.
 pub(crate) struct Preconditioner {
     wide: Wide,
     waves: Waves,
-    /// 1/D of cells that are not of the rim, else 0.
-    inverse: Vec<f64>,
+    /// 1/D of cells that are not of the rim, less beside it ([`FROM_RIM`]); else 0.
+    inverse: Vec<f32>,
     rim: Rim,
     /// 1/D of θ and shifts; 0 for what no measurement determines.
     params: Vec<f64>,
@@ -106,9 +112,11 @@ impl Preconditioner {
         let invert = |d: f64| if d > 0.0 { 1.0 / d } else { 0.0 };
         let weights = &system.weights;
         let least = FAINTEST * weights.iter().sum::<f64>() / weights.len() as f64;
-        let invert_seen = |&d: &f64| if d > least { 1.0 / d } else { 0.0 };
-        let mut inverse: Vec<f64> = weights.iter().map(invert_seen).collect();
-        rim.cells().for_each(|cell| inverse[cell] = 0.0);
+        let [_, weight] = system.ordinary;
+        let mut inverse = around(&rim, beam);
+        for (inverse, d) in inverse.iter_mut().zip(weights) {
+            *inverse *= if *d > least { (weight / d) as f32 } else { 0.0 };
+        }
         let params = whole.into_iter().map(invert).collect();
         let (wide, filters) = (Wide::new(hats, system, control), system.pass.grid.is_spline());
         let cols = system.pass.grid.geometry.beam.cols;
@@ -124,74 +132,90 @@ impl Preconditioner {
     ///
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled).
-    pub(crate) fn apply<T: Real>(
+    pub(crate) fn apply<N: Precision, T: Real>(
         &self,
         system: &System<'_, '_, T>,
-        r: &[f64],
-        z: &mut Vec<f64>,
+        r: &[N],
+        z: &mut Vec<N>,
         control: &Control,
     ) -> Result<()> {
         let (workers, cols) = (system.pass.workers, system.pass.grid.geometry.beam.cols);
         let (of_cells, of_params) = r.split_at(self.inverse.len());
+        let [inward, outward, energy] = self.scales::<N, T>(system);
         let mut heights = self.wide.gather(of_cells, workers);
-        heights.extend_from_slice(of_params);
+        heights.iter_mut().for_each(|height| *height *= inward * energy);
+        heights.extend(of_params.iter().map(|&r| r.into()));
         self.coarse.correct(&mut heights, DAMPING);
         control.check()?;
-        let lines = self.waves.correct(&self.wide, of_cells, workers);
+        let lines = self.waves.correct(&self.wide, of_cells, [inward, energy], workers);
         control.check()?;
-        z.resize(of_cells.len(), 0.0);
+        let (of_hats, coarse) = heights.split_at_mut(self.wide.hats.count());
+        of_hats.iter_mut().for_each(|height| *height *= outward);
+        z.resize(of_cells.len(), N::default());
         workers.map_blocks(z, BAND * cols, |band, part| {
             if control.is_cancelled() {
                 return;
             }
             let first = band * BAND;
             if self.filters {
-                self.filter(of_cells, first, part);
+                self.filter(of_cells, first, [inward, outward], part);
             } else {
                 let own = of_cells[first * cols..].iter().zip(&self.inverse[first * cols..]);
-                part.iter_mut().zip(own).for_each(|(z, (r, inverse))| *z = r * inverse);
+                for (z, (&r, &inverse)) in part.iter_mut().zip(own) {
+                    *z = N::of(outward * f64::from(inverse) * (inward * r.into()));
+                }
             }
-            self.wide.spread(&heights, first, part);
-            self.waves.spread(&self.wide, &lines, first, part);
+            self.wide.spread(of_hats, first, part);
+            self.waves.spread(&self.wide, &lines, first, outward, part);
         });
         control.check()?;
-        self.rim.add(of_cells, z, workers);
-        let coarse = &heights[self.wide.hats.count()..];
+        self.rim.add(of_cells, z, system.units::<N>(), workers);
         let params = of_params.iter().zip(&self.params).zip(coarse);
-        z.extend(params.map(|((r, inverse), height)| r * inverse + height));
+        z.extend(params.map(|((&r, inverse), height)| N::of(r.into() * inverse + *height)));
         // A multiple of the beam is no error, nor is what moves all exposures alike; what rounding
         // leaves of them must not grow.
         system.take_scale_out(&mut z[..self.inverse.len()]);
         let shifts = &mut z[self.inverse.len() + system.fluxes.columns.len()..];
-        let moves = system.centred(shifts);
-        shifts.copy_from_slice(moves.as_flattened());
+        let moves: Vec<f64> = shifts.iter().map(|&shift| shift.into()).collect();
+        let moves = system.centred(&moves);
+        shifts.iter_mut().zip(moves.as_flattened()).for_each(|(z, &shift)| *z = N::of(shift));
         Ok(())
+    }
+
+    /// What brings r into the units of single precision, z out of them, and w₀ times the square of an ordinary
+    /// light, which the matrices of hats and waves are in.
+    fn scales<N: Precision, T: Real>(&self, system: &System<'_, '_, T>) -> [f64; 3] {
+        let ([of_z, of_r], [light, weight]) = (system.units::<N>(), system.ordinary);
+        [of_r / (weight * light), light / of_z, weight * light * light]
     }
 
     /// The part of waves of P⁻¹ r.
     #[cfg(test)]
     pub(super) fn waves_of<T: Real>(&self, system: &System<'_, '_, T>, r: &[f64]) -> Vec<f64> {
-        let lines = self.waves.correct(&self.wide, r, system.pass.workers);
+        let [inward, outward, energy] = self.scales::<f64, T>(system);
+        let lines = self.waves.correct(&self.wide, r, [inward, energy], system.pass.workers);
         let mut found = vec![0.0; r.len()];
-        self.waves.spread(&self.wide, &lines, 0, &mut found);
+        self.waves.spread(&self.wide, &lines, 0, outward, &mut found);
         found
     }
 
     /// χ K D⁻¹ K χ r on rows of cells from `first` on.
-    fn filter(&self, r: &[f64], first: usize, z: &mut [f64]) {
+    fn filter<N: Value>(&self, r: &[N], first: usize, scales: [f64; 2], z: &mut [N]) {
         let (cols, around) = (self.cols, FILTER.len() / 2);
         let [mut before, mut between] = [(); 2].map(|()| FilterRows::new(cols));
+        let [inward, outward] = scales.map(N::of);
         let mut found = vec![0.0; cols];
         // Rows that come in, counted from as many above as both filters reach.
         for step in 0..z.len() / cols + 4 * around {
-            let line = before.next();
             let inside = |row: Option<usize>| row.filter(|&row| row < r.len() / cols);
             let of = |row: usize| row * cols..(row + 1) * cols;
+            let line = before.next();
             match inside((first + step).checked_sub(2 * around)).map(of) {
                 Some(row) => {
                     let input = r[row.clone()].iter().zip(&self.inverse[row]);
-                    let seen = |(r, d): (&f64, &f64)| if *d > 0.0 { *r } else { 0.0 };
-                    line.iter_mut().zip(input).for_each(|(line, input)| *line = seen(input));
+                    for (line, (&r, d)) in line.iter_mut().zip(input) {
+                        *line = if *d > 0.0 { Into::<f64>::into(inward * r) as f32 } else { 0.0 };
+                    }
                 }
                 None => line.fill(0.0),
             }
@@ -205,14 +229,32 @@ impl Preconditioner {
             }
             if let Some(own) = step.checked_sub(4 * around) {
                 between.filter(&mut found);
-                let row = of(first + own);
-                let output = found.iter().zip(&self.inverse[row]);
+                let output = found.iter().zip(&self.inverse[of(first + own)]);
                 for (z, (found, d)) in z[of(own)].iter_mut().zip(output) {
-                    *z = if *d > 0.0 { *found } else { 0.0 };
+                    let seen = if *d > 0.0 { *found } else { 0.0 };
+                    *z = outward * N::of(f64::from(seen));
                 }
             }
         }
     }
+}
+
+/// The share of 1/D that each cell keeps.
+fn around(rim: &Rim, Shape { rows, cols }: Shape) -> Vec<f32> {
+    let mut shares = vec![1.0_f32; rows * cols];
+    let near = |at: usize, end: usize| {
+        let reach = FROM_RIM.len() - 1;
+        at.saturating_sub(reach)..(at + reach + 1).min(end)
+    };
+    for (row, col) in rim.cells().map(|cell| (cell / cols, cell % cols)) {
+        for other in near(row, rows) {
+            for beside in near(col, cols) {
+                let share = &mut shares[other * cols + beside];
+                *share = share.min(FROM_RIM[other.abs_diff(row).max(beside.abs_diff(col))]);
+            }
+        }
+    }
+    shares
 }
 
 /// What the prior of M adds to the hats' own elements, M² D λ/(D + λ) of each pixel in the middle of the cells
@@ -239,9 +281,9 @@ fn prior_of_hats<T: Real>(system: &System<'_, '_, T>, hats: &Hats) -> Vec<f64> {
 
 /// As many rows of cells as the filter takes.
 struct FilterRows {
-    rows: [Vec<f64>; FILTER.len()],
+    rows: [Vec<f32>; FILTER.len()],
     /// One row, with zeros around.
-    line: Vec<f64>,
+    line: Vec<f32>,
 }
 
 impl FilterRows {
@@ -251,13 +293,13 @@ impl FilterRows {
     }
 
     /// A buffer for the row that comes in; the first one goes.
-    fn next(&mut self) -> &mut [f64] {
+    fn next(&mut self) -> &mut [f32] {
         self.rows.rotate_left(1);
         &mut self.rows[FILTER.len() - 1]
     }
 
     /// K at the row in the middle.
-    fn filter(&mut self, found: &mut [f64]) {
+    fn filter(&mut self, found: &mut [f32]) {
         let Self { rows, line } = self;
         let rows = rows.each_ref().map(|row| &row[..]);
         pulp::Arch::new().dispatch(Filter { rows, line, found });
@@ -265,9 +307,9 @@ impl FilterRows {
 }
 
 struct Filter<'s> {
-    rows: [&'s [f64]; FILTER.len()],
-    line: &'s mut [f64],
-    found: &'s mut [f64],
+    rows: [&'s [f32]; FILTER.len()],
+    line: &'s mut [f32],
+    found: &'s mut [f32],
 }
 
 impl pulp::NullaryFnOnce for Filter<'_> {

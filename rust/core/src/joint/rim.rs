@@ -13,7 +13,7 @@ use crate::error::Result;
 use crate::frames::{Real, Shape};
 use crate::geometry::TAPS;
 use crate::linalg::Cholesky;
-use crate::parallel::Workers;
+use crate::parallel::{Value, Workers};
 
 /// A cell is of the rim if one so near has less than this share of its weight: the outermost factor of a
 /// spline is at most a sixth. Where exposures are turned against each other a third cell saves next to nothing,
@@ -59,10 +59,12 @@ impl Rim {
         self.parts.iter().flat_map(|part| &part.cells).map(|&(cell, _)| cell as usize)
     }
 
-    /// Adds (N + τ GᵀG)⁻¹ r on the rim.
-    pub(crate) fn add(&self, r: &[f64], z: &mut [f64], workers: &Workers) {
-        let found = workers.map(self.parts.len(), |index| self.parts[index].apply(r));
-        self.cells().zip(found.into_iter().flatten()).for_each(|(cell, value)| z[cell] += value);
+    /// Adds (N + τ GᵀG)⁻¹ r on the rim, of z and r in such units.
+    pub(crate) fn add<N: Value>(&self, r: &[N], z: &mut [N], units: [f64; 2], workers: &Workers) {
+        let [of_z, of_r] = units;
+        let found = workers.map(self.parts.len(), |index| self.parts[index].apply(r, of_r / of_z));
+        let found = self.cells().zip(found.into_iter().flatten());
+        found.for_each(|(cell, value)| z[cell] += N::of(value));
     }
 }
 
@@ -93,9 +95,10 @@ impl Part {
         Self { cells: tile.cells.clone(), factor, inverse }
     }
 
-    /// (N + τ GᵀG)⁻¹ r, times the shares on either side.
-    fn apply(&self, r: &[f64]) -> Vec<f64> {
-        let own = self.cells.iter().map(|&(cell, share)| share * r[cell as usize]);
+    /// `factor` (N + τ GᵀG)⁻¹ r, times the shares on either side.
+    fn apply<N: Value>(&self, r: &[N], factor: f64) -> Vec<f64> {
+        let of_cell = |cell: u32| Into::<f64>::into(r[cell as usize]);
+        let own = self.cells.iter().map(|&(cell, share)| factor * share * of_cell(cell));
         let mut values: Vec<f64> = own.collect();
         match &self.factor {
             Some(factor) => factor.substitute(&mut values),

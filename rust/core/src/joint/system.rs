@@ -28,7 +28,7 @@ use crate::error::Result;
 use crate::exposures::Exposures;
 use crate::frames::Real;
 use crate::geometry::TAPS;
-use crate::parallel::Workers;
+use crate::parallel::{Value, Workers};
 
 /// A determinant that is rounding alone, of two columns that are degenerate in a pixel.
 const SINGULAR: f64 = 1e-12;
@@ -36,6 +36,60 @@ const SINGULAR: f64 = 1e-12;
 /// The share that D and the rim keep of a measurement which M follows whatever it is, since it is the pixel's only
 /// one: it pulls at nothing, but cells that it sees are seen.
 const FOLLOWED: f64 = 1e-6;
+
+/// Numbers that a search for a step is made in.
+pub(crate) trait Precision: Value {
+    const IS_SINGLE: bool;
+
+    /// What 1 stands for in a step and in a slope, for an ordinary light and an ordinary weight: single
+    /// precision holds no numbers of any size.
+    fn units(light: f64, weight: f64) -> [f64; 2];
+
+    /// [`System::multiply`].
+    fn multiply<T: Real>(
+        system: &mut System<'_, '_, T>,
+        x: &[Self],
+        product: &mut Vec<Self>,
+        share: f64,
+        control: &Control,
+    ) -> Result<f64>;
+}
+
+impl Precision for f64 {
+    const IS_SINGLE: bool = false;
+
+    fn units(_: f64, _: f64) -> [f64; 2] {
+        [1.0; 2]
+    }
+
+    fn multiply<T: Real>(
+        system: &mut System<'_, '_, T>,
+        x: &[Self],
+        product: &mut Vec<Self>,
+        share: f64,
+        control: &Control,
+    ) -> Result<f64> {
+        system.multiply_double(x, product, share, control)
+    }
+}
+
+impl Precision for f32 {
+    const IS_SINGLE: bool = true;
+
+    fn units(light: f64, weight: f64) -> [f64; 2] {
+        [light, weight * light]
+    }
+
+    fn multiply<T: Real>(
+        system: &mut System<'_, '_, T>,
+        x: &[Self],
+        product: &mut Vec<Self>,
+        share: f64,
+        control: &Control,
+    ) -> Result<f64> {
+        system.multiply_single(x, product, share, control)
+    }
+}
 
 /// The problem at a state.
 pub(crate) struct System<'m, 'a, T> {
@@ -61,9 +115,8 @@ pub(crate) struct System<'m, 'a, T> {
     /// A faster product where it serves, and whether it is of the state last linearised.
     fused: Option<Fused>,
     is_fused_anew: bool,
-    /// Whether products may be made in single precision: where no later step makes good what they leave,
-    /// they may not.
-    pub(crate) allows_single: bool,
+    /// An ordinary light and an ordinary weight.
+    pub(super) ordinary: [f64; 2],
     /// Whether the weights and τ are of the state last linearised.
     is_weighed_anew: bool,
     /// Whether the penalty counts more cells than at the state linearised before.
@@ -100,7 +153,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             penalty: None,
             fused: None,
             is_fused_anew: false,
-            allows_single: true,
+            ordinary: [exposures.typical_light(), exposures.typical_weight()],
             is_weighed_anew: false,
             sees_more: false,
             prior: None,
@@ -166,7 +219,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled), here and below.
     pub(crate) fn linearise(&mut self, control: &Control) -> Result<(f64, Vec<f64>)> {
-        self.pass.place(&self.state.shifts, control);
+        self.pass.place(&self.state.shifts);
         // Its bands are those of the shifts.
         self.fused.take_if(|_| self.shift_prior.is_some());
         (self.is_fused_anew, self.is_weighed_anew) = (false, false);
@@ -262,7 +315,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     }
 
     /// x − a (aᵀD x)/(aᵀD a), without the multiple of the beam, which is not determined.
-    pub(crate) fn take_scale_out(&self, x: &mut [f64]) {
+    pub(crate) fn take_scale_out<N: Value>(&self, x: &mut [N]) {
         let multiple = self.pass.workers.dot(&self.scale, x);
         self.pass.workers.add_multiple(x, -multiple, &self.state.beam);
     }
@@ -314,24 +367,25 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
 
     /// S x, and the change of M that goes with x in each [`Row`]; returns the largest size of that less
     /// `share` of the change before.
-    pub(crate) fn multiply(
+    pub(crate) fn multiply<N: Precision>(
         &mut self,
-        x: &[f64],
-        product: &mut Vec<f64>,
+        x: &[N],
+        product: &mut Vec<N>,
         share: f64,
         control: &Control,
     ) -> Result<f64> {
-        let largest = if self.is_single() {
-            self.multiply_single(x, product, share, control)?
-        } else {
-            self.multiply_double(x, product, share, control)?
-        };
+        let largest = N::multiply(self, x, product, share, control)?;
         self.balance(&mut product[..self.state.beam.len()]);
         Ok(largest)
     }
 
-    /// [`multiply`](Self::multiply) in double precision.
-    pub(super) fn multiply_double(
+    /// What 1 stands for in a step and in a slope.
+    pub(crate) fn units<N: Precision>(&self) -> [f64; 2] {
+        let [light, weight] = self.ordinary;
+        N::units(light, weight)
+    }
+
+    fn multiply_double(
         &mut self,
         x: &[f64],
         product: &mut Vec<f64>,
@@ -367,17 +421,18 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         Ok(sums.largest)
     }
 
-    /// [`multiply`](Self::multiply) in single precision.
     fn multiply_single(
         &mut self,
-        x: &[f64],
-        product: &mut Vec<f64>,
+        x: &[f32],
+        product: &mut Vec<f32>,
         share: f64,
         control: &Control,
     ) -> Result<f64> {
         let Some(penalty) = &self.penalty else { return Ok(f64::INFINITY) };
-        let fused = self.fused.get_or_insert_with(|| Fused::new(&self.pass, control));
+        let fused =
+            self.fused.get_or_insert_with(|| Fused::new(&self.pass, self.ordinary, control));
         if !self.is_fused_anew {
+            self.pass.free_sums();
             fused.renew(&self.pass, control);
             control.check()?;
             self.is_fused_anew = true;
@@ -386,9 +441,9 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         fused.multiply(&mut self.pass, penalty, x, share, product, control)
     }
 
-    /// Whether products are made in single precision.
-    pub(crate) fn is_single(&self) -> bool {
-        self.allows_single && Fused::serves(&self.pass)
+    /// Whether products can be made in single precision.
+    pub(crate) fn has_single(&self) -> bool {
+        Fused::serves(&self.pass)
     }
 
     /// What a step pulls at the cells once M and O have followed it.

@@ -15,14 +15,14 @@ use crate::coarse::{
 };
 use crate::frames::Real;
 use crate::geometry::Rotation;
-use crate::parallel::Workers;
+use crate::parallel::{Value, Workers};
 
 /// Rows of cells whose sums a thread makes at a time.
 const BAND: usize = 32;
 
 /// The coarse space of these waves, times the beam.
 pub(super) struct Waves {
-    space: Modulated<f64>,
+    space: Modulated<f32>,
     cols: usize,
 }
 
@@ -56,8 +56,15 @@ impl Waves {
         Self { space, cols: grid.beam.cols }
     }
 
-    /// The lines of the heights that Ψᵀ r has.
-    pub(super) fn correct(&self, wide: &Wide, r: &[f64], workers: &Workers) -> Vec<f64> {
+    /// The lines of the heights that Ψᵀ r has; `inward` brings r into single precision, and `energy` what it
+    /// makes of heights into the units of their matrix.
+    pub(super) fn correct<N: Value>(
+        &self,
+        wide: &Wide,
+        r: &[N],
+        [inward, energy]: [f64; 2],
+        workers: &Workers,
+    ) -> Vec<f32> {
         if self.space.is_empty() {
             return Vec::new();
         }
@@ -65,28 +72,55 @@ impl Waves {
         let bands = workers.map(rows.div_ceil(BAND), |band| {
             let cells = band * BAND * self.cols..r.len().min((band + 1) * BAND * self.cols);
             let beam = &wide.beam[cells.clone()];
-            let values: Vec<f64> =
-                r[cells].iter().zip(beam).map(|(r, a)| r * f64::from(*a)).collect();
+            let values: Vec<f32> =
+                r[cells].iter().zip(beam).map(|(&r, a)| (inward * r.into()) as f32 * a).collect();
             self.space.gather(band * BAND, &values, self.cols)
         });
         let mut heights = vec![0.0; self.space.size()];
         for (first, sums) in bands.into_iter().flatten() {
-            heights[first..].iter_mut().zip(sums).for_each(|(height, sum)| *height += sum);
+            let sums = heights[first..].iter_mut().zip(sums);
+            sums.for_each(|(height, sum)| *height += energy * sum);
         }
         self.space.correct(&mut heights, workers);
         self.space.open(&heights, self.cols, workers)
     }
 
     /// Adds Ψ y to rows of cells from `first` on.
-    pub(super) fn spread(&self, wide: &Wide, lines: &[f64], first: usize, z: &mut [f64]) {
+    pub(super) fn spread<N: Value>(
+        &self,
+        wide: &Wide,
+        lines: &[f32],
+        first: usize,
+        outward: f64,
+        z: &mut [N],
+    ) {
         if self.space.is_empty() {
             return;
         }
         let mut sums = vec![0.0; z.len()];
         self.space.spread(lines, first, &mut sums, self.cols);
         let beam = &wide.beam[first * self.cols..];
-        let cells = z.iter_mut().zip(sums).zip(beam);
-        cells.for_each(|((z, sum), a)| *z += f64::from(*a) * sum);
+        pulp::Arch::new().dispatch(Lit { sums: &sums, beam, outward, z });
+    }
+}
+
+/// Adds sums times the beam.
+struct Lit<'s, N> {
+    sums: &'s [f32],
+    beam: &'s [f32],
+    outward: f64,
+    z: &'s mut [N],
+}
+
+impl<N: Value> pulp::NullaryFnOnce for Lit<'_, N> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        let outward = N::of(self.outward);
+        for (z, (sum, a)) in self.z.iter_mut().zip(self.sums.iter().zip(self.beam)) {
+            *z += outward * N::of(f64::from(sum * a));
+        }
     }
 }
 

@@ -10,6 +10,7 @@ use crate::control::Control;
 use crate::error::Result;
 use crate::exposures::{Exposures, Stretch};
 use crate::frames::{Real, Shape};
+use crate::parallel::Value;
 use crate::sweep::Estimate;
 use crate::weak_light::{self, Prior, Problem};
 
@@ -130,7 +131,7 @@ impl<T: Real> System<'_, '_, T> {
     }
 
     /// A prior of M pulls at the multiple of the beam, which is held: what pulls at cells is without that.
-    pub(super) fn balance(&self, pull: &mut [f64]) {
+    pub(super) fn balance<N: Value>(&self, pull: &mut [N]) {
         if self.prior.is_some() {
             let multiple = self.pass.workers.dot(&self.state.beam, pull);
             self.pass.workers.add_multiple(pull, -multiple, &self.scale);

@@ -8,7 +8,7 @@ use super::system::System;
 use crate::coarse::Hats;
 use crate::control::Control;
 use crate::frames::{Real, Shape};
-use crate::parallel::Workers;
+use crate::parallel::{Value, Workers};
 
 /// Rows of cells whose sums over hats a thread makes at a time.
 const SUMMED: usize = 32;
@@ -16,8 +16,8 @@ const SUMMED: usize = 32;
 pub(crate) struct Wide {
     pub(crate) hats: Hats,
     cols: usize,
-    /// a, and ∂a/3 along rows and columns where the beam is a spline, in single precision; 0 for cells
-    /// that are not seen.
+    /// a, and ∂a/3 along rows and columns where the beam is a spline, in units of an ordinary light and single
+    /// precision; 0 for cells that are not seen.
     pub(super) beam: Vec<f32>,
     slopes: [Vec<f32>; 2],
 }
@@ -26,12 +26,13 @@ impl Wide {
     pub(crate) fn new<T: Real>(hats: Hats, system: &System<'_, '_, T>, control: &Control) -> Self {
         let (beam, cols) = (&system.state.beam, system.pass.grid.geometry.beam.cols);
         let seen = |cell: usize| system.weights.get(cell).is_some_and(|&weight| weight > 0.0);
-        let level = |cell: usize| if seen(cell) { beam[cell] as f32 } else { 0.0 };
+        let [light, _] = system.ordinary;
+        let level = |cell: usize| if seen(cell) { (beam[cell] / light) as f32 } else { 0.0 };
         let slope = |cell: usize, step: usize| {
             let (place, length) = if step == 1 { (cell % cols, cols) } else { (cell, beam.len()) };
             let inside = system.pass.grid.is_spline() && place >= step && place + step < length;
             if inside && [cell - step, cell, cell + step].into_iter().all(seen) {
-                ((beam[cell + step] - beam[cell - step]) / 6.0) as f32
+                ((beam[cell + step] - beam[cell - step]) / (6.0 * light)) as f32
             } else {
                 0.0
             }
@@ -42,7 +43,7 @@ impl Wide {
     }
 
     /// Φᵀ r.
-    pub(crate) fn gather(&self, r: &[f64], workers: &Workers) -> Vec<f64> {
+    pub(crate) fn gather<N: Value>(&self, r: &[N], workers: &Workers) -> Vec<f64> {
         let (hats, cols) = (&self.hats, self.cols);
         let rows = self.beam.len() / cols;
         let bands = workers.map(rows.div_ceil(SUMMED), |band| {
@@ -93,10 +94,10 @@ impl Wide {
     }
 
     /// Adds Φ y to rows of cells from `first` on.
-    pub(crate) fn spread(&self, heights: &[f64], first: usize, z: &mut [f64]) {
+    pub(crate) fn spread<N: Value>(&self, heights: &[f64], first: usize, z: &mut [N]) {
         let cols = self.cols;
         let mut last = usize::MAX;
-        let mut lines = [(); 4].map(|()| vec![0.0; cols]);
+        let mut lines = [(); 4].map(|()| vec![N::default(); cols]);
         for (row, z) in z.chunks_exact_mut(cols).enumerate() {
             let row = first + row;
             let (node, height) = self.hats.rows.at(row as f64);
@@ -109,22 +110,22 @@ impl Wide {
                 z,
                 beam: &self.beam[cells.clone()],
                 slopes: self.slopes.each_ref().map(|slopes| &slopes[cells.clone()]),
-                height,
-                spacing: self.hats.rows.spacing,
+                height: N::of(height),
+                slope: N::of(1.0 / self.hats.rows.spacing),
                 lines: lines.each_ref().map(|line| &line[..]),
             });
         }
     }
 
     /// The heights along the coarse rows above and below at every column, and their slopes.
-    fn open(&self, node: usize, heights: &[f64], lines: &mut [Vec<f64>; 4]) {
+    fn open<N: Value>(&self, node: usize, heights: &[f64], lines: &mut [Vec<N>; 4]) {
         let (nodes, spacing) = (self.hats.cols.nodes, self.hats.cols.spacing);
         for below in 0..2 {
             let heights = &heights[(node + below) * nodes..][..nodes];
             for (col, &(node, share)) in self.hats.columns.iter().enumerate() {
                 let (left, right) = (heights[node as usize], heights[node as usize + 1]);
-                lines[below][col] = left + f64::from(share) * (right - left);
-                lines[2 + below][col] = (right - left) / spacing;
+                lines[below][col] = N::of(left + f64::from(share) * (right - left));
+                lines[2 + below][col] = N::of((right - left) / spacing);
             }
         }
     }
@@ -147,15 +148,15 @@ fn on_cells<T: Real>(
 
 /// Sums of r a down a coarse cell, by the heights of the hats above and below, of r ∂a/3 along rows
 /// likewise, and of r ∂a/3 down, which a falling hat has less.
-struct Level<'s> {
-    values: &'s [f64],
+struct Level<'s, N> {
+    values: &'s [N],
     beam: &'s [f32],
     slopes: [&'s [f32]; 2],
     height: f64,
     sums: [&'s mut [f64]; 5],
 }
 
-impl pulp::NullaryFnOnce for Level<'_> {
+impl<N: Value> pulp::NullaryFnOnce for Level<'_, N> {
     type Output = ();
 
     #[inline(always)]
@@ -163,7 +164,7 @@ impl pulp::NullaryFnOnce for Level<'_> {
         let [above, below, above_turn, below_turn, fall] = self.sums;
         let [down, along] = self.slopes;
         for col in 0..self.values.len() {
-            let r = self.values[col];
+            let r: f64 = self.values[col].into();
             let (level, turn) = (r * f64::from(self.beam[col]), r * f64::from(along[col]));
             above[col] += (1.0 - self.height) * level;
             below[col] += self.height * level;
@@ -175,17 +176,18 @@ impl pulp::NullaryFnOnce for Level<'_> {
 }
 
 /// Adds smooth heights h times the spline: h a − ∇h·∇a/3.
-struct Smooth<'s> {
-    z: &'s mut [f64],
+struct Smooth<'s, N> {
+    z: &'s mut [N],
     beam: &'s [f32],
     slopes: [&'s [f32]; 2],
-    height: f64,
-    spacing: f64,
+    /// The height of the hat below, and its slope.
+    height: N,
+    slope: N,
     /// h above and below, and its slopes along.
-    lines: [&'s [f64]; 4],
+    lines: [&'s [N]; 4],
 }
 
-impl pulp::NullaryFnOnce for Smooth<'_> {
+impl<N: Value> pulp::NullaryFnOnce for Smooth<'_, N> {
     type Output = ();
 
     #[inline(always)]
@@ -196,9 +198,9 @@ impl pulp::NullaryFnOnce for Smooth<'_> {
             let fall = below[col] - above[col];
             let height = above[col] + self.height * fall;
             let slope = above_slope[col] + self.height * (below_slope[col] - above_slope[col]);
-            let (a, along, down) =
-                (f64::from(self.beam[col]), f64::from(along[col]), f64::from(down[col]));
-            self.z[col] += a * height - along * slope - down * fall / self.spacing;
+            let [a, along, down] =
+                [self.beam[col], along[col], down[col]].map(|value| N::of(f64::from(value)));
+            self.z[col] += a * height - along * slope - down * (fall * self.slope);
         }
     }
 }

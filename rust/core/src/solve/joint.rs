@@ -15,7 +15,8 @@ use crate::exposures::{Exposures, FluxKind};
 use crate::fit::{Fit, Refinement, Solution};
 use crate::frames::Real;
 use crate::gauge::FluxGauge;
-use crate::joint::{self, ConjugateGradients, Directions, Preconditioner, ShiftPrior, System};
+use crate::joint::{self, ConjugateGradients, Directions, Known, Precision, Preconditioner};
+use crate::joint::{ShiftPrior, System};
 use crate::memory;
 use crate::parallel::Workers;
 use crate::weak_light::WeakLight;
@@ -74,7 +75,9 @@ pub(super) fn minimise<T: Real>(
 /// Steps towards the minimum.
 struct Steps<'m, 'a, T> {
     system: System<'m, 'a, T>,
-    search: ConjugateGradients,
+    known: Known,
+    /// Whether products may be made in single precision.
+    allows_single: bool,
     options: &'m Options,
     /// The most passes.
     limit: u64,
@@ -120,7 +123,8 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         }
         Ok(Self {
             system,
-            search: ConjugateGradients::default(),
+            known: Known::default(),
+            allows_single: true,
             options,
             limit,
             swept,
@@ -162,18 +166,34 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             Some(preconditioner) => preconditioner,
             None => Preconditioner::new(&mut self.system, control)?,
         };
+        let is_single = self.allows_single && self.system.has_single();
+        let look = if is_single { Self::look::<f32> } else { Self::look::<f64> };
+        let ended = look(self, objective, slope, &preconditioner, control)?;
+        self.preconditioner = (!moving).then_some(preconditioner);
+        Ok(ended)
+    }
+
+    /// A look at F with this slope, and a step, by a search in numbers of this precision; says why the search has
+    /// ended, if it has.
+    fn look<N: Precision>(
+        &mut self,
+        objective: f64,
+        slope: Vec<f64>,
+        preconditioner: &Preconditioner,
+        control: &Control,
+    ) -> Result<Option<Ended>> {
         let kept = self.system.seeks_shifts().then(|| slope.clone());
-        self.search.begin(&self.system, &preconditioner, slope, control)?;
-        let first = self.search.product(&mut self.system, control)?;
-        let error = self.search.lowest.over(first);
+        let mut search = ConjugateGradients::<N>::after(self.known.clone());
+        search.begin(&self.system, preconditioner, slope, control)?;
+        let first = search.product(&mut self.system, control)?;
+        let error = search.known.lowest.over(first);
         self.looks.push(Look::new(self.products(), objective, error));
         if self.begins_to_refine(error) {
             return Ok(None);
         }
         let ended = self.ended();
         if ended.is_none() {
-            self.step(first, kept, &preconditioner, control)?;
-            self.preconditioner = (!moving).then_some(preconditioner);
+            self.step(search, first, kept, preconditioner, control)?;
         }
         Ok(ended)
     }
@@ -217,7 +237,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
     /// Seeks the shifts too, once the beam is nearly found, if it has structure.
     fn begins_to_refine(&mut self, error: f64) -> bool {
         let near = error <= BEFORE_SHIFTS.max(self.options.tolerance)
-            && self.search.iterations >= FEWEST_ITERATIONS;
+            && self.known.iterations >= FEWEST_ITERATIONS;
         let Some(mut prior) = self.shift_prior.take_if(|_| near) else { return false };
         self.refinement = match self.system.determined_directions(&prior) {
             Directions::None => Refinement::Undetermined,
@@ -229,38 +249,41 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         }
         prior.along = self.refinement.along();
         self.system.seek_shifts(Some(prior));
-        (self.search, self.taken, self.looks) = (ConjugateGradients::default(), None, Vec::new());
+        (self.known, self.taken, self.looks) = (Known::default(), None, Vec::new());
         true
     }
 
     /// Searches for a step and takes it, with the slope where it begins if shifts are sought.
-    fn step(
+    fn step<N: Precision>(
         &mut self,
+        mut search: ConjugateGradients<N>,
         first: f64,
         slope: Option<Vec<f64>>,
         preconditioner: &Preconditioner,
         control: &Control,
     ) -> Result<()> {
-        let least = if self.system.is_single() { PRECISION } else { CURVED[0] };
+        let least = if N::IS_SINGLE { PRECISION } else { CURVED[0] };
         let share = if slope.is_some() { BY_SHIFTS } else { first.clamp(least, CURVED[1]) };
         let reachable = first * share;
         let (mut least, mut waited) = (first, 0);
         while self.products() + A_LOOK < self.limit && waited < PATIENCE_OF_A_SEARCH {
             let done = self.products();
             control.report("calibrate", done, TYPICAL.max(done).min(self.limit));
-            if !self.search.step(&self.system, preconditioner, control)? {
+            if !search.step(&self.system, preconditioner, control)? {
                 break;
             }
             control.check()?;
-            let size = self.search.product(&mut self.system, control)?;
+            let size = search.product(&mut self.system, control)?;
             (least, waited) = if size < 0.5 * least { (size, 0) } else { (least, waited + 1) };
             let aim = AIM * self.options.tolerance;
-            let near = size <= reachable || self.search.lowest.over(size) <= aim;
-            if near && self.search.iterations >= FEWEST_ITERATIONS {
+            let near = size <= reachable || search.known.lowest.over(size) <= aim;
+            if near && search.known.iterations >= FEWEST_ITERATIONS {
                 break;
             }
         }
-        let mut step = std::mem::take(&mut self.search.x);
+        self.known = search.known;
+        let [unit, _] = self.system.units::<N>();
+        let mut step: Vec<f64> = search.x.into_iter().map(|x| unit * x.into()).collect();
         // A multiple of the beam is no step, but the penalty would see one.
         let cells = self.system.state.beam.len();
         self.system.take_scale_out(&mut step[..cells]);
@@ -269,10 +292,9 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         self.course = slope.map(turn);
         self.system.advance(&step, 1.0);
         self.taken = Some(step);
-        if waited == PATIENCE_OF_A_SEARCH && self.system.is_single() {
+        if waited == PATIENCE_OF_A_SEARCH && N::IS_SINGLE {
             // Its smallest Ritz value is that of rounding too.
-            self.system.allows_single = false;
-            self.search = ConjugateGradients::default();
+            (self.allows_single, self.known) = (false, Known::default());
         }
         Ok(())
     }
@@ -298,7 +320,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
     fn ended(&self) -> Option<Ended> {
         let last = self.looks.last()?;
         let settled = last.error <= ROUNDING;
-        let certain = self.search.iterations >= FEWEST_ITERATIONS || settled;
+        let certain = self.known.iterations >= FEWEST_ITERATIONS || settled;
         let patience = if self.system.seeks_shifts() { PATIENCE_BY_SHIFTS } else { 0 };
         let stalled = stalled_since(&self.looks).is_some_and(|earlier| {
             earlier >= SETTLING && self.looks[earlier].sweep + patience <= last.sweep
@@ -320,7 +342,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         let exposures = system.pass.exposures;
         let without_offset = system.without_offset();
         let history = History { looks: self.looks, ended };
-        let smallest = self.search.lowest.found();
+        let smallest = self.known.lowest.found();
         let mut fit = fit(system, history, self.refinement, smallest, control)?;
         let priors = fit.prior.as_ref().zip(system.prior.as_ref());
         let (held, freed) = priors.map_or((Vec::new(), 0.0), |(weights, prior)| {

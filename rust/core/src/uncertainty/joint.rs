@@ -63,7 +63,7 @@ enum Functional {
 pub(super) struct JointCovariance<'m, 'a, T> {
     system: System<'m, 'a, T>,
     preconditioner: Preconditioner,
-    search: ConjugateGradients,
+    search: ConjugateGradients<f64>,
     tilts: Tilts,
     /// The shifts that are uncertain though they were not refined.
     considered: Option<ShiftPrior>,
@@ -95,7 +95,6 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         let prior = ShiftPrior::of(exposures.positions());
         let (refined, considered) = parted(solution.refinement, prior);
         system.seek_shifts(refined);
-        system.allows_single = false;
         system.prior = solution.prior.as_ref().map(|weights| {
             let (weights, mean) = (weights.to_vec(), 1.0);
             joint::Prior { weights, mean }
@@ -411,7 +410,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         for iteration in 1..=MOST_ITERATIONS {
             search.product(system, control)?;
             let goes_on = search.step(system, preconditioner, control)?;
-            let left = search.square / search.lowest.found();
+            let left = search.square / search.known.lowest.found();
             if !goes_on || iteration >= FEWEST_ITERATIONS && left <= lack * search.energy {
                 return Ok(());
             }
