@@ -458,6 +458,21 @@ def test_gains_for_the_upload_of_a_camera(made, tmp_path, run):
         hardware.Table.of(Polynomial(planes, response.flags), **UPLOAD)
 
 
+def test_files_are_corrected_by_what_the_words_stand_for(made, tmp_path, run):
+    array, response = made
+    table = hardware.Table.of(response, out_step=4.0, out_bits=12)
+    table.save(tmp_path / "table.bin")
+    raw = next(array.frames(10e6, 1, rng=9))
+    np.save(tmp_path / "raw.npy", raw)
+    given = ("correct", tmp_path / "table.bin", tmp_path / "raw.npy", "-o", tmp_path / "done.tif")
+    assert run(*given)[0] == 0
+    found = tifffile.imread(tmp_path / "done.tif")
+    offset, gain = table.coefficients
+    np.testing.assert_allclose(found, offset + gain * raw, rtol=1e-6)
+    # Half a step of the output, and of the ADC, which sees whole raw values here.
+    assert np.nanmax(np.abs(found - table.correct(raw))) == pytest.approx(2.0, rel=0.01)
+
+
 def test_two_c_headers_go_into_one_program(made, tmp_path):
     names = {"left": {"lowest": 700.0}, "right-2": {"gain_bits": 11, "out_bits": 14}}
     tables = {name: hardware.Table.of(made[1], **options) for name, options in names.items()}
