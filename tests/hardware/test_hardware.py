@@ -185,24 +185,6 @@ def test_coefficients_are_those_of_the_words(made):
     assert isinstance(table, equipix.Correction)
 
 
-@pytest.mark.parametrize("dtype", ["float32", "uint16"])
-def test_a_corrector_gives_what_the_words_give(made, dtype):
-    table = hardware.Table.of(made[1], gain_bits=9)
-    raw = np.random.default_rng(4).integers(900, 3900, (2, *SHAPE), np.uint16)
-    words = table.apply(table.digitise(raw))
-    wanted = np.ldexp(table.format.zero + words.astype(np.float64), table.format.out)
-    corrector = equipix.Corrector(table, dtype, flagged="keep")
-    for given in (raw, raw[0]):
-        got = corrector.apply(given)
-        used = np.broadcast_to(usable(table.flags), given.shape)
-        exact = wanted[: len(raw) if given is raw else 1].reshape(given.shape)
-        exact = np.clip(np.rint(exact), 0, None) if dtype == "uint16" else exact
-        np.testing.assert_array_equal(got[used], exact[used])
-    assert corrector.frames == 3
-    with pytest.raises(errors.InputError, match="dark"):
-        equipix.Corrector(table, dark=None)
-
-
 def test_pixels_that_must_not_be_used_have_the_code_0(made):
     table = hardware.Table.of(made[1])
     bad = (made[1].flags & Flag.DO_NOT_USE) != 0

@@ -194,7 +194,8 @@ class CorrectionBase(Shown, ReadOnly):
                 double = not {raw.dtype, result.dtype} <= {*FAST}
                 prepared = _prepared(self, dark, flagged, double=double)
             else:
-                prepared = Prepared(self, _same(self.shape), flagged, double=True)
+                same = np.broadcast_to(np.array([0.0, 1.0])[:, None, None], (2, *self.shape))
+                prepared = Prepared(self, same, flagged, double=True)
             prepared.write(raw, result, formula)
         return result
 
@@ -235,11 +236,6 @@ def _prepared(correction: Any, dark: Dark, flagged: Flagged, *, double: bool) ->
     if stays:
         object.__setattr__(correction, "_last", (key, made))
     return made
-
-
-def _same(shape: tuple[int, int]) -> Array:
-    """Coefficients (2, rows, cols) that change nothing."""
-    return np.broadcast_to(np.array([0.0, 1.0])[:, None, None], (2, *shape))
 
 
 def each_frame(stack: Array) -> Array:
@@ -368,7 +364,6 @@ class Corrector:
     A corrected value is c₀ + y·(c₁ + y·(c₂ + y·c₃)), in float32 by Horner's scheme, each operation
     rounded: the same bytes on every processor. Whole numbers are rounded half to even. A value of
     16 bits with four coefficients is off by less than 0.05 DN through float32.
-    A `hardware.Table` gives what its words give, in DN, as its own ``correct``.
 
     A pixel is replaced by the mean of the good ones of its eight neighbours; where there are none,
     by that of neighbours replaced before. Behind colour filters those of its colour count, on the
@@ -410,12 +405,7 @@ class Corrector:
         if levels is not None and not (levels[1] > levels[0]).any():
             levels = None
         with naming_memory("preparing a correction"):
-            formula_of = getattr(correction, "_formula", None)
-            self._formula = formula_of and formula_of(dark, False)
-            if self._formula is None:
-                planes = with_dark(correction, dark).coefficients
-            else:
-                planes = _same(self.shape)
+            planes = with_dark(correction, dark).coefficients
             self._prepared = Prepared(correction, planes, flagged, levels=levels)
         good = int(np.count_nonzero(usable(correction.flags)))
         self.replaced = correction.flags.size - good if flagged == "replace" and good else 0
@@ -461,10 +451,8 @@ class Corrector:
             self._prepared.depth.refuse_type(raw.dtype)
             result = np.empty(raw.shape, self.dtype) if out is None else self._checked(out, raw)
             limited, outside, highest = self._prepared.run(
-                self._by_formula(raw), result, self._largest, self._workers
+                raw, result, self._largest, self._workers
             )
-            if self._formula is not None:
-                highest = float(np.fmax.reduce(raw, axis=None))
         self._prepared.depth.refuse_highest(highest, raw.dtype)
         with self._counting:
             self.clipped += limited
@@ -472,15 +460,6 @@ class Corrector:
             if self.extrapolated is not None:
                 self.extrapolated += outside
         return result
-
-    def _by_formula(self, raw: Array) -> Array:
-        """Frames as a table of words gives them, exact in float32; others as they are."""
-        if self._formula is None:
-            return raw
-        found = np.empty(raw.shape, np.float32)
-        for source, target in zip(each_frame(raw), each_frame(found), strict=True):
-            target[...] = self._formula(source)
-        return found
 
     def _checked(self, out: Array, raw: Array) -> Array:
         """Refuse an array that the result cannot be written to."""
