@@ -62,10 +62,7 @@ fn the_answer_of_others_is_that_without_them() {
         let others = fit(&with_few(experiment, none), Options::to(TOLERANCE)).unwrap();
         assert!(found.converged && others.converged);
         assert!((0..PIXELS).all(|pixel| found.few[pixel] == (few(pixel) < 5)));
-        // Cells that shifts bring into sight on their way stay in the penalty: then F depends on the way, by
-        // less than what moves one unknown by its standard deviation.
-        let limit = if std.is_some() { 1.0 } else { 1e-6 * others.misfit };
-        assert!((found.misfit - others.misfit).abs() < limit);
+        assert!((found.misfit / others.misfit - 1.0).abs() < 1e-6);
         assert_eq!(found.degrees_of_freedom, others.degrees_of_freedom);
         // Free fluxes leave a tilt to the gauge, which is that of all pixels.
         if found.leaves_tilt {
@@ -174,10 +171,7 @@ fn pixels_measured_once_are_lost_where_they_alone_see_cells() {
         let none = |pixel| if is_lost(pixel) { 0 } else { times(pixel) };
         let others = fit(&with_few(experiment, none), Options::to(TOLERANCE)).unwrap();
         assert!(found.converged && others.converged);
-        // Cells that shifts bring into sight on their way stay in the penalty: then F depends on the way, by
-        // less than what moves one unknown by its standard deviation.
-        let limit = if std.is_some() { 1.0 } else { 1e-6 * others.misfit };
-        assert!((found.misfit - others.misfit).abs() < limit);
+        assert!((found.misfit / others.misfit - 1.0).abs() < 1e-6);
         assert_eq!(found.degrees_of_freedom, others.degrees_of_freedom);
         let std = error_map(&all, &found, 1).unwrap().std;
         for (pixel, std) in std.iter().enumerate() {
@@ -219,10 +213,7 @@ fn measurements_apart_are_lost_where_they_alone_see_cells() {
             ragged(k, pixel) && !found.lost[k].contains(&pixel)
         }));
         assert!(found.converged && others.converged);
-        // Cells that shifts bring into sight on their way stay in the penalty: then F depends on the way, by
-        // less than what moves one unknown by its standard deviation.
-        let limit = if std.is_some() { 1.0 } else { 1e-6 * others.misfit };
-        assert!((found.misfit - others.misfit).abs() < limit);
+        assert!((found.misfit / others.misfit - 1.0).abs() < 1e-6);
         // Degrees of freedom count cells by the weights of whole exposures, those of lost measurements too.
         assert!(found.degrees_of_freedom.abs_diff(others.degrees_of_freedom) <= 1);
         assert_eq!(found.labels[0], others.labels[0]);

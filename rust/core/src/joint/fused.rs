@@ -137,7 +137,7 @@ impl Fused {
         let sizes = [fused.bands.height * of_row, fused.bands.length];
         let bands = pass.workers.map_pairs(&mut rows, &mut sums, sizes, |band, rows, strips| {
             let rows = rows.chunks_exact_mut(of_row);
-            fused.band(seen, x, band, rows, share, strips, control)
+            fused.band(seen, (x, share), band, rows, strips, control)
         });
         (pass.rows, self.sums) = (rows, sums);
         pass.count += 1;
@@ -151,10 +151,9 @@ impl Fused {
     fn band<'r, T: Real>(
         &self,
         pass: &Pass<'_, '_, T>,
-        x: &[f32],
+        (x, share): (&[f32], f64),
         band: usize,
         rows: impl ExactSizeIterator<Item = &'r mut [f64]>,
-        share: f64,
         strips: &mut [f32],
         control: &Control,
     ) -> f64 {

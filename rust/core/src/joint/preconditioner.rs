@@ -34,7 +34,7 @@ const FILTER: [f32; 5] = [0.08, -0.445, 1.73, -0.445, 0.08];
 
 /// What is left of 1/D so many cells away from the rim: nothing on it, and less beside it, since a filter that is
 /// cut off takes fine patterns there for three times what they are.
-const FROM_RIM: [f32; 3] = [0.0, 0.5, 0.7];
+pub(super) const FROM_RIM: [f32; 3] = [0.0, 0.5, 0.7];
 
 /// Its arrays are in single precision, in units of an ordinary light and weight.
 pub(crate) struct Preconditioner {
@@ -141,6 +141,7 @@ impl Preconditioner {
     ) -> Result<()> {
         let (workers, cols) = (system.pass.workers, system.pass.grid.geometry.beam.cols);
         let (of_cells, of_params) = r.split_at(self.inverse.len());
+        debug_assert_eq!(of_params.len(), self.params.len());
         let [inward, outward, energy] = self.scales::<N, T>(system);
         let mut heights = self.wide.gather(of_cells, workers);
         heights.iter_mut().for_each(|height| *height *= inward * energy);
@@ -240,7 +241,7 @@ impl Preconditioner {
 }
 
 /// The share of 1/D that each cell keeps.
-fn around(rim: &Rim, Shape { rows, cols }: Shape) -> Vec<f32> {
+pub(super) fn around(rim: &Rim, Shape { rows, cols }: Shape) -> Vec<f32> {
     let mut shares = vec![1.0_f32; rows * cols];
     let near = |at: usize, end: usize| {
         let reach = FROM_RIM.len() - 1;

@@ -2,7 +2,7 @@
 
 use super::flux::Fluxes;
 use super::layout::Grid;
-use super::preconditioner::Preconditioner;
+use super::preconditioner::{FROM_RIM, Preconditioner, around};
 use super::rim::{NEAR_OF_TURNED as NEAR, Rim};
 use super::system::System;
 use super::unknowns::State;
@@ -162,6 +162,56 @@ fn on_the_rim_the_normal_matrix_is_inverted() {
         }
         let outside = (0..normal.len()).filter(|cell| !cells.contains(cell));
         assert!(outside.into_iter().all(|cell| found[cell] == 0.0));
+    });
+}
+
+#[test]
+fn less_is_left_beside_the_rim() {
+    with_turned(|system, _| {
+        let shape = system.pass.grid.geometry.beam;
+        let rim = Rim::new(system, &Control::new()).unwrap();
+        let cells: Vec<usize> = rim.cells().collect();
+        for (cell, share) in around(&rim, shape).into_iter().enumerate() {
+            let away = |other: &usize| {
+                let rows = (cell / shape.cols).abs_diff(other / shape.cols);
+                rows.max((cell % shape.cols).abs_diff(other % shape.cols))
+            };
+            let nearest = cells.iter().map(away).min().unwrap();
+            assert!(share == FROM_RIM.get(nearest).copied().unwrap_or(1.0));
+        }
+    });
+}
+
+#[test]
+fn the_preconditioner_is_symmetric_and_the_same_in_single_precision() {
+    let (variance, mask) = uneven();
+    with_system(&[Rotation::None; 4], &each(&variance), &Mask::Measurements(&mask), |system| {
+        let control = Control::new();
+        let preconditioner = Preconditioner::new(system, &control).unwrap();
+        let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+        // Pulls at no multiple of the beam, as those of measurements.
+        let pulls = |seed: usize| -> Vec<f64> {
+            let cells = 0..system.size();
+            let white: Vec<f64> = cells.map(|cell| random(cell + seed) - 0.5).collect();
+            let multiple = dot(&white, &system.state.beam);
+            let scale = system.scale.iter();
+            white.iter().zip(scale).map(|(r, scale)| r - multiple * scale).collect()
+        };
+        let (r, s) = (pulls(17), pulls(4711));
+        let (mut of_r, mut of_s) = (Vec::new(), Vec::new());
+        preconditioner.apply(system, &r, &mut of_r, &control).unwrap();
+        preconditioner.apply(system, &s, &mut of_s, &control).unwrap();
+        // Its arrays are in single precision; z is a sum of some 100 of their products.
+        let rounding = 100.0 * f64::from(f32::EPSILON);
+        let size = (dot(&r, &of_r) * dot(&s, &of_s)).sqrt();
+        assert!(size > 0.0 && (dot(&r, &of_s) - dot(&s, &of_r)).abs() < rounding * size);
+        let [step, slope] = system.units::<f32>();
+        let short: Vec<f32> = r.iter().map(|r| (r / slope) as f32).collect();
+        let mut single = Vec::new();
+        preconditioner.apply(system, &short, &mut single, &control).unwrap();
+        let pairs = single.iter().zip(&of_r).zip(&system.weights);
+        let off = pairs.map(|((one, z), d)| d * (step * f64::from(*one) - z).powi(2)).sum::<f64>();
+        assert!(off.sqrt() < rounding * dot(&r, &of_r).sqrt(), "{}", off.sqrt());
     });
 }
 

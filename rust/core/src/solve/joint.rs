@@ -168,8 +168,11 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         };
         let is_single = self.allows_single && self.system.has_single();
         let look = if is_single { Self::look::<f32> } else { Self::look::<f64> };
+        let sought = self.system.seeks_shifts();
         let ended = look(self, objective, slope, &preconditioner, control)?;
-        self.preconditioner = (!moving).then_some(preconditioner);
+        // It has a place for shifts only if it was made where they are sought.
+        let stays = !moving && sought == self.system.seeks_shifts();
+        self.preconditioner = stays.then_some(preconditioner);
         Ok(ended)
     }
 
