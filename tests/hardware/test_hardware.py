@@ -419,6 +419,14 @@ def test_gains_for_the_upload_of_a_camera(made, tmp_path, run):
     flat = tmp_path / "flat.npz"
     polynomial(0.0, np.linspace(0.9, 1.1, 5)).save(flat)
     assert run("hardware", flat, "--preset", "upload", "-o", tmp_path / "flat.tif")[1].count("none")
+    # A line in place of curves has offsets of its own: here those of curves are 0.
+    curved = tmp_path / "curved.npz"
+    polynomial(0.0, 1.0, np.linspace(1e-6, 3e-6, 5)).save(curved)
+    options = ("--preset", "upload", "--linearise", 1000, 3000, "--json")
+    told = json.loads(run("hardware", curved, *options, "-o", tmp_path / "curved.tif")[1])
+    # Of c y² the chord has c (lo + hi) as its gain and -c lo hi as its offset, and half of the sag.
+    lost = np.std(np.linspace(1e-6, 3e-6, 5)) * (3e6 + 0.5e6)
+    assert f"the offsets of the correction differ by {lost:.3g} DN" in str(told["findings"])
     with pytest.raises(errors.FileError, match="or wrote it for other programs alone, as gains"):
         equipix.load(tmp_path / "gain.tif")
     other, level = tmp_path / "other.tif", tmp_path / "level.tif"
