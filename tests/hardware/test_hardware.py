@@ -711,9 +711,9 @@ def test_a_curved_correction_needs_a_line():
         assert found == pytest.approx(np.full((4, 5), left), abs=2.0**-4 + 1048 * 2.0**-16 + 1e-3)
 
 
-def test_a_line_that_leaves_a_pattern_is_a_finding():
-    # Sags of c (h/2)² from 20 to 40 DN: half of their spread is left.
-    bend = np.linspace(2e-5, 4e-5, 5)
+@pytest.mark.parametrize("bend", [np.linspace(2e-5, 4e-5, 5), 4e-5 * np.array([1, -1, 1, -1, -1])])
+def test_a_line_that_leaves_a_pattern_is_a_finding(bend):
+    # Sags of c (h/2)² up to 40 DN, upwards or downwards: half of their spread is left.
     words = f"up to 20 DN, and a pattern with a standard deviation of {np.std(bend) * 1e6 / 2:.3g}"
     with pytest.warns(errors.InputWarning, match=words):
         table = hardware.Table.of(polynomial(10.0, 1.0, bend), linearise=(1000.0, 3000.0))
