@@ -97,16 +97,17 @@ class TestExperiment:
             ("dark-2.fits", 1.0, -20.0),
         ]
 
-    def test_headers_say_which_images_are_dark(self, run, tmp_path):
+    @pytest.mark.parametrize("bias", ["Bias Frame", "zero"])
+    def test_headers_say_which_images_are_dark(self, run, tmp_path, bias):
         """As capture programs write them: one name, and the type in the header."""
-        types = ["Dark Frame", "Bias Frame", "Dark Frame", "Light Frame", "FLAT"]
+        types = ["Dark Frame", bias, "Dark Frame", "Light Frame", "FLAT"]
         for k, each in enumerate(types):
             write_fits(tmp_path / f"img_{k:04}.fits", 1.0, level=100 + k, IMAGETYP=each)
         write_fits(tmp_path / "dark/0.fits", 1.0, level=200, OBSTYPE="OBJECT")
         write_fits(tmp_path / "hole/0.fits", 1.0, level=201, FRAME="dark")
         status, _, err = run("init", "experiment", tmp_path)
         assert status == 0
-        assert "not used: 'img_0001.fits' (is 'Bias Frame' by its header (IMAGETYP))" in err
+        assert f"not used: 'img_0001.fits' (is '{bias}' by its header (IMAGETYP))" in err
         found = tomllib.loads((tmp_path / "experiment.toml").read_text())
         assert [each["frames"] for each in found["dark"]] == [
             ["img_0000.fits", "img_0002.fits", "hole/0.fits"]
