@@ -117,6 +117,13 @@ class TestExperiment:
             "dark/0.fits",
         ]
 
+    @pytest.mark.parametrize("suffix", [".fits.gz", ".FITS.gz"])
+    def test_examples_beside_compressed_images_are_of_their_format(self, run, tmp_path, suffix):
+        for k, name in enumerate(("dark", "p0", "p1")):
+            write_fits(tmp_path / name / f"a{suffix}", 1.0, level=100 + k)
+        assert run("init", "experiment", tmp_path)[0] == 0
+        assert '"hole/p1-before.fits"' in (tmp_path / "experiment.toml").read_text()
+
     def test_darks_of_unknown_times_are_asked_for_by_folder(self, run, tmp_path):
         for k, name in enumerate(("dark-a/0", "dark-a/1", "dark-b/0", "dark-b/1", "p0/0", "p1/0")):
             write(tmp_path / f"{name}.tif", 100 + k)
