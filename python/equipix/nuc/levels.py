@@ -189,10 +189,11 @@ def levels_of(
     excluded = given if averaged is not None else union(given, measured.mask)
     values = measured.values if excluded is None else np.where(excluded, np.nan, measured.values)
     filters = _filters(values, measured.colours)
+    stuck: Bools | None = None
     if averaged is not None:
         stuck = averaged.always_saturated
-    else:
-        stuck = None if measured.mask is None else measured.mask.all(axis=0)
+    elif measured.mask is not None:
+        stuck = np.logical_and.reduce(measured.mask)
     bad_pixels = _with_stuck(values, measured.bad_pixels, stuck, given)
     bad_pixels = _with_odd_responses(values, noise, bad_pixels, filters)
     good = _good(values, bad_pixels, given)
