@@ -353,7 +353,8 @@ class TestCombine:
         ],
     )
     def test_what_is_known_of_the_sensor_is_kept(self, one, other, wanted):
-        planes, flags = np.ones((2, *SHAPE)), np.zeros(SHAPE, np.uint32)
+        planes = np.stack([np.zeros(SHAPE), np.ones(SHAPE)])
+        flags = np.zeros(SHAPE, np.uint32)
         first, then = (
             equipix.Polynomial(planes, flags, {} if each is None else {"sensor": each})
             for each in (one, other)
@@ -364,7 +365,8 @@ class TestCombine:
             both.correct(np.full(SHAPE, 4096, np.uint16))
 
     def test_bits_of_corrected_frames_are_not_those_of_raw_ones(self):
-        planes, flags = np.ones((2, *SHAPE)), np.zeros(SHAPE, np.uint32)
+        planes = np.stack([np.zeros(SHAPE), np.ones(SHAPE)])
+        flags = np.zeros(SHAPE, np.uint32)
         first = equipix.Polynomial(planes, flags, saturation=4095.0)
         then = equipix.Polynomial(planes, flags, {"sensor": {"bit_depth": 16, "saturation": 6e4}})
         both = equipix.combine(first, then)
@@ -377,9 +379,11 @@ class TestCombine:
         with pytest.raises(errors.InputError, match="'then' has degree 3"):
             equipix.combine(response, response)
         line = response.coefficients[:2]
-        once = equipix.Polynomial(line, response.flags)
-        with pytest.raises(errors.InputError, match="gains of 'first', which would be applied tw"):
-            equipix.combine(once, equipix.Polynomial(line, response.flags, {"other": 1}))
+        offset = np.stack([np.full(SHAPE, -100.0), np.ones(SHAPE)])
+        for planes in (line, offset):
+            once = equipix.Polynomial(planes, response.flags)
+            with pytest.raises(errors.InputError, match="gains of 'first', .* be applied twice"):
+                equipix.combine(once, equipix.Polynomial(planes, response.flags, {"other": 1}))
         one, other = (
             equipix.Polynomial(line, response.flags, {"sensor": {"name": name}}) for name in "AB"
         )

@@ -97,16 +97,17 @@ class TestExperiment:
             ("dark-2.fits", 1.0, -20.0),
         ]
 
-    def test_headers_say_which_images_are_dark(self, run, tmp_path):
+    @pytest.mark.parametrize("bias", ["Bias Frame", "zero"])
+    def test_headers_say_which_images_are_dark(self, run, tmp_path, bias):
         """As capture programs write them: one name, and the type in the header."""
-        types = ["Dark Frame", "Bias Frame", "Dark Frame", "Light Frame", "FLAT"]
+        types = ["Dark Frame", bias, "Dark Frame", "Light Frame", "FLAT"]
         for k, each in enumerate(types):
             write_fits(tmp_path / f"img_{k:04}.fits", 1.0, level=100 + k, IMAGETYP=each)
         write_fits(tmp_path / "dark/0.fits", 1.0, level=200, OBSTYPE="OBJECT")
         write_fits(tmp_path / "hole/0.fits", 1.0, level=201, FRAME="dark")
         status, _, err = run("init", "experiment", tmp_path)
         assert status == 0
-        assert "not used: 'img_0001.fits' (is 'Bias Frame' by its header (IMAGETYP))" in err
+        assert f"not used: 'img_0001.fits' (is '{bias}' by its header (IMAGETYP))" in err
         found = tomllib.loads((tmp_path / "experiment.toml").read_text())
         assert [each["frames"] for each in found["dark"]] == [
             ["img_0000.fits", "img_0002.fits", "hole/0.fits"]
@@ -115,6 +116,13 @@ class TestExperiment:
             ["img_0003.fits", "img_0004.fits"],
             "dark/0.fits",
         ]
+
+    @pytest.mark.parametrize("suffix", [".fits.gz", ".FITS.gz"])
+    def test_examples_beside_compressed_images_are_of_their_format(self, run, tmp_path, suffix):
+        for k, name in enumerate(("dark", "p0", "p1")):
+            write_fits(tmp_path / name / f"a{suffix}", 1.0, level=100 + k)
+        assert run("init", "experiment", tmp_path)[0] == 0
+        assert '"hole/p1-before.fits"' in (tmp_path / "experiment.toml").read_text()
 
     def test_darks_of_unknown_times_are_asked_for_by_folder(self, run, tmp_path):
         for k, name in enumerate(("dark-a/0", "dark-a/1", "dark-b/0", "dark-b/1", "p0/0", "p1/0")):

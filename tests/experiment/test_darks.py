@@ -404,6 +404,7 @@ def test_an_average_says_what_its_dark_was_taken_with(tmp_path, camera, run):
     [
         ("dark.fits", "Light Frame", r"'dark.fits' in \[dark\] is 'Light .*, expected dark frames"),
         ("p1.fits", "Dark Frame", r"'p1.fits' in 'frames' of exposure 'p1' is 'Dark Frame' by its"),
+        ("p0.fits", "zero", r"is 'zero' by its header"),
         ("p0.fits", "bias", r"is 'bias' by its header \(IMAGETYP\), expected frames with light"),
     ],
 )
@@ -422,6 +423,7 @@ def test_a_header_of_another_type_of_image_is_named(tmp_path, name, shown, words
 def test_a_level_may_be_dark_frames_and_its_dark_no_light(tmp_path, camera):
     path = fits_levels(tmp_path, camera)
     fits.setval(tmp_path / "level1.fits", "IMAGETYP", value="DARK")
+    fits.setval(tmp_path / "dark1.fits", "IMAGETYP", value="zero")
     LevelExperiment.load(path).run()
     fits.setval(tmp_path / "dark1.fits", "IMAGETYP", value="FLAT")
     with pytest.raises(errors.FileError, match=r"'dark1.fits' in .* is 'FLAT' by its header"):

@@ -419,6 +419,14 @@ def test_gains_for_the_upload_of_a_camera(made, tmp_path, run):
     flat = tmp_path / "flat.npz"
     polynomial(0.0, np.linspace(0.9, 1.1, 5)).save(flat)
     assert run("hardware", flat, "--preset", "upload", "-o", tmp_path / "flat.tif")[1].count("none")
+    # A line in place of curves has offsets of its own: here those of curves are 0.
+    curved = tmp_path / "curved.npz"
+    polynomial(0.0, 1.0, np.linspace(1e-6, 3e-6, 5)).save(curved)
+    options = ("--preset", "upload", "--linearise", 1000, 3000, "--json")
+    told = json.loads(run("hardware", curved, *options, "-o", tmp_path / "curved.tif")[1])
+    # Of c y² the chord has c (lo + hi) as its gain and -c lo hi as its offset, and half of the sag.
+    lost = np.std(np.linspace(1e-6, 3e-6, 5)) * (3e6 + 0.5e6)
+    assert f"the offsets of the correction differ by {lost:.3g} DN" in str(told["findings"])
     with pytest.raises(errors.FileError, match="or wrote it for other programs alone, as gains"):
         equipix.load(tmp_path / "gain.tif")
     other, level = tmp_path / "other.tif", tmp_path / "level.tif"
@@ -703,9 +711,9 @@ def test_a_curved_correction_needs_a_line():
         assert found == pytest.approx(np.full((4, 5), left), abs=2.0**-4 + 1048 * 2.0**-16 + 1e-3)
 
 
-def test_a_line_that_leaves_a_pattern_is_a_finding():
-    # Sags of c (h/2)² from 20 to 40 DN: half of their spread is left.
-    bend = np.linspace(2e-5, 4e-5, 5)
+@pytest.mark.parametrize("bend", [np.linspace(2e-5, 4e-5, 5), 4e-5 * np.array([1, -1, 1, -1, -1])])
+def test_a_line_that_leaves_a_pattern_is_a_finding(bend):
+    # Sags of c (h/2)² up to 40 DN, upwards or downwards: half of their spread is left.
     words = f"up to 20 DN, and a pattern with a standard deviation of {np.std(bend) * 1e6 / 2:.3g}"
     with pytest.warns(errors.InputWarning, match=words):
         table = hardware.Table.of(polynomial(10.0, 1.0, bend), linearise=(1000.0, 3000.0))

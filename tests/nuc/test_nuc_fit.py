@@ -482,6 +482,20 @@ class TestBadPixels:
         response = nuc.fit(levels[6:], order=1, saturation=4095)
         assert response.flags[3, 4] == stuck & ~Flag.HOT
 
+    def test_a_pixel_without_values_that_saturates_at_one_level_is_not_hot(self, levels):
+        levels[:-1, 3, 4], levels[-1, 3, 4] = np.nan, 4095
+        wanted = Flag.DO_NOT_USE | Flag.SATURATED | Flag.NO_FLAT_FIELD
+        assert nuc.fit(levels, order=1, saturation=4095).flags[3, 4] == wanted
+        # Nor is one whose dark is not known.
+        levels[:-1, 3, 4] = levels[:-1, 3, 5]
+        dark = np.full((4, *SHAPE), 10.0)
+        dark[:, 3, 4] = np.nan
+        frames = (np.repeat(np.rint(each)[None], 4, axis=0) for each in levels)
+        dark = equipix.average(dark, saturation=4095)
+        averages = [equipix.average(each, saturation=4095, dark=dark) for each in frames]
+        response = nuc.fit(averages, order=1, variance=np.full(8, 1 / 12))
+        assert response.flags[3, 4] == wanted
+
     def test_masked_pixels_are_undetermined(self, levels):
         mask = np.zeros(SHAPE, bool)
         mask[:, :5] = True

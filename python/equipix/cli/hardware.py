@@ -6,11 +6,12 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import typer
 
-from equipix._check import naming_memory
+from equipix._check import Floats, naming_memory
 from equipix.cli import terminal
 from equipix.correction.protocol import Correction, check_sensor
 from equipix.errors import InputError
 from equipix.findings import Finding, Findings, say, usable
+from equipix.hardware.encode import line_of
 from equipix.hardware.quality import Cost, Trial, trial, widths_of
 from equipix.hardware.table import IMAGES, SUFFIXES, UPLOAD, Table
 from equipix.hardware.words import WIDEST
@@ -90,7 +91,8 @@ def hardware(
     table = Table.of(correction, **options)
     cost, said = _cost(result, correction, frames, options) if frames else ({}, ())
     if gains_alone:
-        said = say(*_lost_offsets(correction, table))
+        (offsets, _), _ = line_of(correction, options["linearise"], np.inf)
+        said = say(*_lost_offsets(offsets, table))
     table.save(output, force=force)
     figures = {"output": str(output), **summary(table), **cost}
     if gains_alone:
@@ -99,9 +101,9 @@ def hardware(
     terminal.show_result(figures, table.findings + said, as_json=as_json)
 
 
-def _lost_offsets(correction: Correction, table: Table) -> Findings:
+def _lost_offsets(offsets: Floats, table: Table) -> Findings:
     """Say how much the offsets differ that a file of gains alone does not hold."""
-    lost = float(np.std(correction.coefficients[0][usable(table.flags)]))
+    lost = float(np.std(offsets[usable(table.flags)]))
     if lost < 2.0**table.format.adc / 2:
         return ()
     words = (

@@ -127,12 +127,13 @@ def combine(first: Correction, then: Correction) -> Polynomial:
     _refuse_raw(then)
     before = np.asarray(first.coefficients, np.float64)
     multiplies = np.any(np.nan_to_num(gain, nan=1.0) != 1.0)
-    if multiplies and np.array_equal(before, after, equal_nan=True):
+    shifts = np.nan_to_num(after[0]).any()
+    if (multiplies or shifts) and np.array_equal(before, after, equal_nan=True):
         raise InputError(
             "'then' has the offsets and gains of 'first', which would be applied twice: expected "
             "a correction of frames that 'first' has corrected"
         )
-    leaves = first.leaves_offset and not np.nan_to_num(after[0]).any()
+    leaves = first.leaves_offset and not shifts
     if leaves and multiplies:
         raise InputError(
             "'first' leaves an offset in corrected frames, as a response to raw levels, a scene "

@@ -10,7 +10,7 @@ from equipix.experiment.found_images import FoundImages, ImageGroup, find_images
 from equipix.experiment.manifest import CameraManifest, LevelManifest, Manifest, Sensor, Table
 from equipix.experiment.templates import BLANK, template
 from equipix.findings import Finding
-from equipix.io.frames import Settings, apart
+from equipix.io.frames import Settings, apart, suffix_of
 
 _EXAMPLES = [ImageGroup(name, name, [name], f"{name}/*.tif") for name in ("p0", "p1", "dark")]
 """What stands for the images of a folder without any."""
@@ -22,6 +22,9 @@ _TITLE = (
 
 _CONTROL = r"[\x00-\x1f\x7f]"
 """Characters of names that end a comment of TOML, or that it refuses."""
+
+_PACKED = r"\.[gf]z$"
+"""Suffix of a compressed file, behind that of its format."""
 
 _Entry = str | list[str]
 """Names of files as a manifest has them."""
@@ -66,7 +69,8 @@ def draft_manifest(kind: str, folder: Path, start: Path) -> Draft:
     sensor = {} if found.raw else {"bit_depth": BLANK}
     title = " ".join([*(each.message + "." for each in findings if each.kind == "images"), _TITLE])
     text = template(model, title, {"sensor": sensor, **values}) + _comments(unused)
-    suffixes = [PurePosixPath(name).suffix for name in (*found.files, *unused)]
+    plain = (re.sub(_PACKED, "", name.lower()) for name in (*found.files, *unused))
+    suffixes = [suffix for suffix in map(suffix_of, map(Path, plain)) if suffix]
     if suffixes and ".tif" not in suffixes:  # examples are as the images that there are
         text = text.replace('.tif"', f'{suffixes[0]}"')
     blanks = text.count(f' = "{BLANK}"')

@@ -275,10 +275,11 @@ _STEPS = 65
 
 def line_of(
     correction: Correction, linearise: tuple[float, float] | None, largest: float
-) -> tuple[tuple[Floats, Floats], Floats]:
-    """Offset and gain of each pixel, and the sag of each usable curve that a line replaces, in DN.
+) -> tuple[tuple[Floats, Floats], tuple[float, float]]:
+    """Offset and gain of each pixel; largest sag of usable curves, and the pattern of lines, in DN.
 
-    The sag is the range of the difference between the curve and the line through its ends.
+    The sag is the range of the difference between the curve and the line through its ends. The
+    pattern is the largest standard deviation over the pixels of what the lines leave of the curves.
 
     Raises
     ------
@@ -297,7 +298,7 @@ def line_of(
                 "(--linearise), two raw values in DN between which a straight line takes the place "
                 "of the curve"
             )
-        return (planes[0], planes[1]), np.zeros(0)
+        return (planes[0], planes[1]), (0.0, 0.0)
     return _chord(planes, usable(correction.flags), *_checked_range(linearise, largest))
 
 
@@ -324,15 +325,23 @@ def _checked_range(linearise: object, largest: float) -> tuple[float, float]:
 
 def _chord(
     planes: Floats, used: Bools, low: float, high: float
-) -> tuple[tuple[Floats, Floats], Floats]:
-    """Line parallel to the chord with the smallest largest deviation, and the sag if usable."""
+) -> tuple[tuple[Floats, Floats], tuple[float, float]]:
+    """Line parallel to the chord with the smallest largest deviation, largest sag, and pattern."""
     ends = [np.asarray(polyval(value, planes)) for value in (low, high)]
     gain = (ends[1] - ends[0]) / (high - low)
     offset = ends[0] - gain * low
     lowest, highest = np.zeros(gain.shape), np.zeros(gain.shape)
-    for value in np.linspace(low, high, _STEPS):
+    values = np.linspace(low, high, _STEPS)
+    for value in values:
         away = polyval(value, planes) - offset - gain * value
         lowest, highest = np.minimum(lowest, away), np.maximum(highest, away)
-    sag = (highest - lowest)[used & np.isfinite(gain)]
     # Half of the sag is left on either side.
-    return (offset + (lowest + highest) / 2, gain), sag
+    offset += (lowest + highest) / 2
+    used = used & np.isfinite(gain)
+    if not used.any():
+        return (offset, gain), (0.0, 0.0)
+    # By the values left, which have a sign: curves may be bent either way.
+    pattern = max(
+        np.std((polyval(value, planes) - offset - gain * value)[used]) for value in values
+    )
+    return (offset, gain), (float((highest - lowest)[used].max()), float(pattern))

@@ -204,13 +204,12 @@ class Table(RawCorrection, Content):
         )
         with naming_memory("making a table"):
             largest = _largest_raw(correction, adc)
-            line, sags = line_of(correction, linearise, largest)
+            line, (sag, pattern) = line_of(correction, linearise, largest)
             found = encode(line, correction.flags, widths, steps, float(lowest))
             refuse_far_lowest(found, line, largest)
             refuse_far_offsets(found, line, widths, steps, float(lowest))
         colours, source = correction.colours, origin(correction)
         depth = correction.bits if source.get("sensor", {}).get("bit_depth") else 0
-        sag, pattern = float(sags.max(initial=0)), float(np.std(sags)) / 2 if sags.size else 0.0
         said = say(*_limits(found, depth, sag, pattern))
         metadata = {
             **source,
@@ -363,11 +362,7 @@ def _largest_raw(correction: Correction, adc: int) -> float:
 
 
 def _limits(made: Content, depth: int, sag: float, pattern: float) -> tuple[Finding, ...]:
-    """Say what words lose of a correction, of a sensor of so many bits; 0 if that is not known.
-
-    A line in place of curves leaves half of their sags: at the ends of its range, and in its middle
-    with the opposite sign. Their standard deviation over the pixels is the pattern.
-    """
+    """Say what words lose of a correction, of a sensor of so many bits; 0 if that is not known."""
     f, error = made.format, made.metadata["largest_error_dn"]
     full = 2.0 ** (f.adc_bits + f.adc)
     end = full + float(np.mean(made.coarse)) * 2.0**f.coarse
@@ -384,8 +379,7 @@ def _limits(made: Content, depth: int, sag: float, pattern: float) -> tuple[Find
     bent = (
         f"the line that 'linearise' puts in place of curves leaves up to {sag / 2:.3g} DN, and a "
         f"pattern with a standard deviation of {pattern:.3g} DN over the pixels (limit, a step of "
-        f"the ADC: {2.0**f.adc:g} DN): name a narrower range, or compare C and C of the table by "
-        "hardware.quality (--frames)"
+        f"the ADC: {2.0**f.adc:g} DN): name a narrower range, or correct frames by the curves"
     )
     found = (
         ("words", coarse, error > _COARSE * full),

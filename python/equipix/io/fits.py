@@ -34,7 +34,7 @@ _TYPES = ("IMAGETYP", "OBSTYPE", "FRAME")
 
 _KINDS = {
     "dark": ("dark",),
-    "bias": ("bias",),
+    "bias": ("bias", "zero"),  # zero: as IRAF calls it
     "light": ("light", "object", "science", "flat"),
 }
 """What the words on types of images contain, of several the first."""

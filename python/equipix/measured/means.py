@@ -133,6 +133,7 @@ class Averaged:
             self.values = np.empty((self.count, *shape), self.dtype)
             self.variances = np.empty((self.count, *shape), np.float32)
             self.saturated = np.zeros(shape, bool)
+            self.always_saturated = np.ones(shape, bool)
             shown = pattern_of(frames.mean) if self.colours is None else self.colours
             self._period = (1, 1) if shown is None else shown.period
         if shape != self.saturated.shape:
@@ -156,6 +157,7 @@ class Averaged:
         self.values[exposure][saturates] = np.nan
         self.variances[exposure] = frames.variance
         self.saturated |= saturates
+        self.always_saturated &= saturates
         count = int(frames.count.max())
         self.frames.append(count)
         self.names.append(name)

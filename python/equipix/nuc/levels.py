@@ -189,7 +189,12 @@ def levels_of(
     excluded = given if averaged is not None else union(given, measured.mask)
     values = measured.values if excluded is None else np.where(excluded, np.nan, measured.values)
     filters = _filters(values, measured.colours)
-    bad_pixels = _with_stuck(values, measured.bad_pixels, given)
+    stuck: Bools | None = None
+    if averaged is not None:
+        stuck = averaged.always_saturated
+    elif measured.mask is not None:
+        stuck = np.logical_and.reduce(measured.mask)
+    bad_pixels = _with_stuck(values, measured.bad_pixels, stuck, given)
     bad_pixels = _with_odd_responses(values, noise, bad_pixels, filters)
     good = _good(values, bad_pixels, given)
     references = _references(values, good)
@@ -261,21 +266,22 @@ def _level_noise(model: NoiseModel, values: Array, pedestal: float) -> LevelNois
     return LevelNoise(float(model.variance(signal)) - common - slope * signal, slope, pedestal)
 
 
-def _with_stuck(values: Array, bad_pixels: BadPixels, mask: Bools | None) -> BadPixels:
+def _with_stuck(
+    values: Array, bad_pixels: BadPixels, stuck: Bools | None, mask: Bools | None
+) -> BadPixels:
     """Add pixels that saturate at each level, also where their neighbours are far below.
 
     At the lowest level the neighbours have less than half of what the array has at the highest.
     """
-    if bad_pixels.saturated is None or not all(np.isfinite(each).any() for each in values):
+    if stuck is None or not all(np.isfinite(each).any() for each in values):
         return bad_pixels
-    stuck = bad_pixels.saturated & np.isnan(values).all(axis=0)
     if mask is not None:
-        stuck &= ~mask.reshape(-1, *stuck.shape).any(axis=0)
+        stuck = stuck & ~mask.reshape(-1, *stuck.shape).any(axis=0)
     if not stuck.any():
         return bad_pixels
     means = [median(each) for each in values]
     around = of_blocks(block_medians(values[int(np.argmin(means))]), stuck.shape)
-    stuck &= around < DEAD_RESPONSE * max(means)
+    stuck = stuck & (around < DEAD_RESPONSE * max(means))
     return dataclasses.replace(bad_pixels, hot=union(bad_pixels.hot, stuck))
 
 
