@@ -581,12 +581,20 @@ def test_an_output_that_no_folder_takes_is_named_alone(run, experiment):
         average(np.zeros((2, 3, 4))).save("/proc/x.npz")
 
 
-def test_a_usage_error_names_the_help_of_the_command(run):
-    status, _, err = run("nuc", "fit", "levels.toml", "-o")
-    assert (status, err.endswith("requires an argument (see equipix nuc fit --help)\n")) == (
-        2,
-        True,
-    )
+@pytest.mark.parametrize(
+    ("given", "wrong"),
+    [
+        ("fit levels.toml -o", "Option '-o' requires an argument"),
+        ("-v fit levels.toml -o", "Option '-o' requires an argument"),
+        ("--bogus fit levels.toml", "No such option: --bogus"),
+        ("-v fit", "Missing argument 'levels'"),
+    ],
+)
+def test_a_usage_error_names_the_help_of_the_command(run, given, wrong):
+    status, _, err = run("nuc", *given.split())
+    assert status == 2
+    assert err.startswith(f"equipix: error: {wrong}")
+    assert err.endswith("(see equipix nuc fit --help)\n")
 
 
 def test_a_full_disk_is_named(tmp_path):
