@@ -146,8 +146,10 @@ def test_inspect_shows_the_calibration(run, calibration):
     # The sign of the shifts is said once, in words that go with "findings none".
     assert re.search(r"findings +none", out)
     assert "shift sign" not in out
-    words = "the data do not determine the orientation: the beam is smooth, which is no fault"
-    assert re.search(rf"orientation of the shifts +{words} \(see .*\)\n", out)
+    words = (
+        "the data do not determine the orientation: the beam is too smooth for that, which is no"
+    )
+    assert re.search(rf"orientation of the shifts +{words} fault; compare .* docs/shifts.md", out)
     _, out, _ = run("inspect", calibration, "--json")
     assert json.loads(out)["shift_sign"] == "undetermined"
     told, saved = json.loads(out), equipix.load(calibration)
