@@ -264,6 +264,12 @@ def test_errors_of_m_count_the_drift_once(results):
     (table,) = (each for each in part_of("it", plain, NOTHING).tables if "cause" in each.title)
     assert {row[1] for row in table.rows} == {"not known"}
     assert "see its findings" in table.rows[0]
+    for kind, why in (("known", "not estimated"), ("fit", "the fluxes were fitted")):
+        options = {**plain.metadata["options"], "flux": kind}
+        fluxes = dataclasses.replace(plain, metadata={**plain.metadata, "options": options})
+        tables = part_of("it", fluxes, NOTHING).tables
+        (table,) = (each for each in tables if "cause" in each.title)
+        assert table.rows[-1][2] == f"in the tilt; {why}"
 
 
 def test_dead_and_hot_pixels_are_listed_before_those_of_a_mask(results):
