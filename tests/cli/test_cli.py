@@ -146,8 +146,10 @@ def test_inspect_shows_the_calibration(run, calibration):
     # The sign of the shifts is said once, in words that go with "findings none".
     assert re.search(r"findings +none", out)
     assert "shift sign" not in out
-    words = "the data do not determine the orientation: the beam is smooth, which is no fault"
-    assert re.search(rf"orientation of the shifts +{words} \(see .*\)\n", out)
+    words = (
+        "the data do not determine the orientation: the beam is too smooth for that, which is no"
+    )
+    assert re.search(rf"orientation of the shifts +{words} fault; compare .* docs/shifts.md", out)
     _, out, _ = run("inspect", calibration, "--json")
     assert json.loads(out)["shift_sign"] == "undetermined"
     told, saved = json.loads(out), equipix.load(calibration)
@@ -581,12 +583,20 @@ def test_an_output_that_no_folder_takes_is_named_alone(run, experiment):
         average(np.zeros((2, 3, 4))).save("/proc/x.npz")
 
 
-def test_a_usage_error_names_the_help_of_the_command(run):
-    status, _, err = run("nuc", "fit", "levels.toml", "-o")
-    assert (status, err.endswith("requires an argument (see equipix nuc fit --help)\n")) == (
-        2,
-        True,
-    )
+@pytest.mark.parametrize(
+    ("given", "wrong"),
+    [
+        ("fit levels.toml -o", "Option '-o' requires an argument"),
+        ("-v fit levels.toml -o", "Option '-o' requires an argument"),
+        ("--bogus fit levels.toml", "No such option: --bogus"),
+        ("-v fit", "Missing argument 'levels'"),
+    ],
+)
+def test_a_usage_error_names_the_help_of_the_command(run, given, wrong):
+    status, _, err = run("nuc", *given.split())
+    assert status == 2
+    assert err.startswith(f"equipix: error: {wrong}")
+    assert err.endswith("(see equipix nuc fit --help)\n")
 
 
 def test_a_full_disk_is_named(tmp_path):

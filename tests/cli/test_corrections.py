@@ -153,6 +153,8 @@ class TestLens:
         assert [each["kind"] for each in json.loads(printed)["findings"]] == ["falloff"]
         focal, error = found.focal_length, found.std["focal_length"]
         assert f"f is {focal:.4g} ± {error:.2g} pixels by noise alone" in err
+        err = run("lens", *given, "--force", "--law", "radial")[2]
+        assert "too weak to determine a law, and large scales" in err
 
     def test_figures_have_units_and_the_map_is_the_gain(self, run, tmp_path, light):
         np.save(tmp_path / "flat.npy", light)

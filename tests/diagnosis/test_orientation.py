@@ -81,8 +81,12 @@ def test_fringes_along_rows_determine_no_sign_along_columns(mirrored):
     frames = photograph(3, fringes(SENSOR))
     found = asked(frames, Orientation(cols=mirrored).shifts(CROSS.astype(float)))
     assert (found.rows, found.cols, found.sign) == ("confirmed", "undetermined", "undetermined")
-    assert "do not determine the orientation (they do confirm the sign along rows" in found.words
-    assert "the beam is smooth, which is no fault" in found.words
+    sure = "(they do confirm the sign along rows and the order of the axes)"
+    assert f"do not determine the sign along columns {sure}: the beam" in found.words
+    assert found.words.endswith(
+        "is too smooth for that, which is no fault; compare the axes of the stage once with the "
+        "figure in docs/shifts.md, or put structure into the beam"
+    )
 
 
 def test_rows_reversed_in_fringes_are_never_confirmed():

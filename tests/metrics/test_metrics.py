@@ -440,6 +440,7 @@ class TestEmvaTransfer:
         point = np.zeros((41, 41))
         point[20, 20] = 1.0
         kept = float(np.sqrt(np.sum(high_passed(point) ** 2)))
+        power = np.abs(np.fft.fft2(high_passed(point))) ** 2  # of mean kept²
         assert kept == pytest.approx(0.99423, abs=5e-6)
         rng = np.random.default_rng(1)
         pattern = 1000 * (1 + 0.01 * rng.standard_normal((200, 300)))
@@ -448,8 +449,10 @@ class TestEmvaTransfer:
             metrics.emva_spatial(dark[::-1] + pattern, dark, highpass=each).prnu.total
             for each in (True, False)
         )
-        # Of 60 000 values, of which the filter takes 1.1 % of the variance.
-        assert found / plain == pytest.approx(kept, abs=5 * (1 - kept) / np.sqrt(60_000 / 169))
+        # The ratio squared is the mean of the filter's power, weighted by that of the pattern: of
+        # 60 000 values at 30 000 frequencies, each with a standard deviation of its own mean.
+        scatter = power.std() / np.sqrt(30_000) / (2 * kept)
+        assert found / plain == pytest.approx(kept, abs=5 * scatter)
 
     def test_darks_that_are_brighter_than_most_levels_are_named(self):
         rng = np.random.default_rng(1)

@@ -272,7 +272,7 @@ class TestCommands:
         status, out, err = run(*given)
         assert status == 0
         assert "warning: curves of order 1" in err
-        assert "fit with order 2 or order auto" in err
+        assert "fit with --order 2 or --order auto" in err
         assert "curves of order" not in run(*given, "--order", "2")[2]
         two = text.split("[[level]]")
         (tmp_path / "levels.toml").write_text("[[level]]".join(two[:3]), encoding="utf-8")

@@ -732,7 +732,7 @@ class TestMisfit:
         levels = noisy(curves(truth(2, rng)), rng)
         with pytest.warns(errors.MisfitWarning, match="no other order predicts") as found:
             nuc.fit(levels, order="auto", variance=NoiseModel(read_noise=0.2, gain=0.0025))
-        assert "order auto" not in str(found[0].message)
+        assert "order='auto'" not in str(found[0].message)
 
     def test_residuals_far_below_the_noise_are_named(self):
         rng = np.random.default_rng(22)
@@ -763,7 +763,7 @@ class TestMisfit:
         pixels = SHAPE[0] * SHAPE[1] / (4 if cfa else 1)
         # Of a colour the largest of three ratios; its own error beside that of noise alone.
         assert ratio == pytest.approx(1 + times**2, rel=5 * 2.33 * np.sqrt(2 / pixels))
-        assert f"order {order + 1} or order auto" in found.findings[-1].message
+        assert f"order={order + 1} or order='auto'" in found.findings[-1].message
 
     @pytest.mark.parametrize("count", [3, 4])
     @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")

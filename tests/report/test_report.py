@@ -101,6 +101,15 @@ def test_each_kind_of_result_has_a_part(results):
         assert f">{name}</h2>" in text
 
 
+def test_a_long_table_is_folded_and_printed(results):
+    part = part_of("cal", results["calibration"], NOTHING)
+    few, many = (part.tables[0]._replace(rows=[("a",) * 6] * count) for count in (40, 41))
+    text = page([part._replace(tables=[few, many])], "One")
+    assert "<details open><summary>40 rows" in text
+    assert "<details><summary>41 rows" in text
+    assert re.search(r'"beforeprint", .*"details"\)\) each\.open = true', text)
+
+
 def test_findings_stand_in_the_page_as_text(results):
     text = page([part_of("cal", results["calibration"], NOTHING)], "One")
     assert "the lamp drifts by <2 %" not in text
@@ -264,6 +273,12 @@ def test_errors_of_m_count_the_drift_once(results):
     (table,) = (each for each in part_of("it", plain, NOTHING).tables if "cause" in each.title)
     assert {row[1] for row in table.rows} == {"not known"}
     assert "see its findings" in table.rows[0]
+    for kind, why in (("known", "not estimated"), ("fit", "the fluxes were fitted")):
+        options = {**plain.metadata["options"], "flux": kind}
+        fluxes = dataclasses.replace(plain, metadata={**plain.metadata, "options": options})
+        tables = part_of("it", fluxes, NOTHING).tables
+        (table,) = (each for each in tables if "cause" in each.title)
+        assert table.rows[-1][2] == f"in the tilt; {why}"
 
 
 def test_dead_and_hot_pixels_are_listed_before_those_of_a_mask(results):

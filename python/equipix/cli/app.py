@@ -60,7 +60,8 @@ class _Commands(TyperGroup):
         if name is not None:
             found = command(name)
             # Of a group the command, whose options are not those of the others.
-            CALLED.set(getattr(found, "commands", {}).get(next(iter(rest), ""), found))
+            inner = getattr(found, "commands", {})
+            CALLED.set(next((inner[each] for each in rest if each in inner), found))
         return name, found, rest
 
 

@@ -109,11 +109,12 @@ def lens(
 
 def _weak(found: LensFalloff, falloff: float) -> str:
     """Say that a fall-off is too weak to be that of a lens, and how far f is off by noise alone."""
-    focal = f": f is {found.focal_length:.4g} ± {found.std.get('focal_length', 0):.2g} pixels"
+    error = found.std.get("focal_length", 0)
+    focal = f": f is {found.focal_length:.4g} ± {error:.2g} pixels by noise alone"
     return (
         f"the fall-off takes {falloff:.2g} of the light in the corner (limit {_LEAST_FALLOFF:g}), "
-        f"too weak to determine a law{focal if found.law == 'cos4' else ''} by noise alone, and "
-        "large scales of the sensor's gain are as large: see that the flat has not been corrected "
+        f"too weak to determine a law{focal if found.law == 'cos4' else ''}, and large "
+        "scales of the sensor's gain are as large: see that the flat has not been corrected "
         "for its fall-off already"
     )
 

@@ -22,7 +22,7 @@ from equipix.experiment import image_files
 from equipix.findings import Findings
 from equipix.io.formats import raw_header, read_mask
 from equipix.io.frames import FrameFiles
-from equipix.io.paths import find_files, refuse_inputs
+from equipix.io.paths import check_suffix, find_files, refuse_inputs
 from equipix.measured.statistics import FrameStatistics
 from equipix.nuc.response import Response
 from equipix.report import limits
@@ -162,9 +162,8 @@ def check_output(
     """
     if path is None:
         return
-    if suffixes and path.suffix.lower() not in suffixes:
-        wanted = ", ".join(suffixes)
-        raise InputError(f"'{path}' ends in '{path.suffix}', expected the suffix {wanted}")
+    if suffixes:
+        check_suffix(path, suffixes)
     if path.exists() and path.is_dir() != folder:
         kind, wanted = ("file", "folder") if folder else ("folder", "file")
         raise FileError(f"'{path}' is a {kind}, expected the name of a {wanted}")

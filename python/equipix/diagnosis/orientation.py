@@ -44,8 +44,8 @@ _QUESTIONS = {
 }
 
 _REMEDY = (
-    "compare the axes of the stage once with the figure in docs/shifts.md, or put an object with "
-    "structure into the beam"
+    "compare the axes of the stage once with the figure in docs/shifts.md, or put structure into "
+    "the beam"
 )
 
 
@@ -104,12 +104,17 @@ class OrientationTest(Brief):
             return "the data confirm the signs and the order of the shifts"
         if self.sign == "contradicted":
             return f"the data contradict the orientation of the shifts: {self.best.words}"
-        known = {name: getattr(self, name) for name in _QUESTIONS if name != "turned"}
-        sure = [_QUESTIONS[name] for name, it in known.items() if it == "confirmed"]
-        parts = f" (they do confirm {' and '.join(sure)})" if sure else ""
         if self.is_likely and self.hidden is not None:
             return f"the orientation of the shifts is probably wrong: {self.hidden.words}"
-        return f"the data do not determine the orientation{parts}: {self.reason}"
+        # The direction of turns is "confirmed" without any, which is no news.
+        sure = [_QUESTIONS[name] for name in self._that_are("confirmed") if name != "turned"]
+        unsure = [_QUESTIONS[name] for name in self._that_are("undetermined")]
+        asked = " and ".join(unsure) if sure else "the orientation"
+        parts = f" (they do confirm {' and '.join(sure)})" if sure else ""
+        return f"the data do not determine {asked}{parts}: {self.reason}"
+
+    def _that_are(self, answer: ShiftSign) -> list[str]:
+        return [name for name in _QUESTIONS if getattr(self, name) == answer]
 
 
 def orientation_test(
@@ -290,7 +295,7 @@ def _answer(left: set[Orientation], name: str) -> ShiftSign:
 
 def _reason(low: WindowFit, best: Orientation) -> str:
     if low.is_white:  # nothing is wrong
-        return "the beam is smooth, which is no fault (see docs/shifts.md)"
+        return f"the beam is too smooth for that, which is no fault; {_REMEDY}"
     return (
         f"in the best orientation ('{best.words}') residuals of neighbours are still correlated by "
         f"{max(abs(each.size) for each in low.neighbours):.0%}: look for another cause, such as "

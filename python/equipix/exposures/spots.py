@@ -96,8 +96,8 @@ def measure_shift(
 
     The spot is the largest set of connected pixels above half of the spot's level over a smooth
     background. This search takes background and noise of at most 2²⁰ pixels, evenly spread, which
-    leaves an error of 0.1 % of the noise. The centroid is the first moment of the
-    background-subtracted signal in a window that holds the spot and its blurred outline; the
+    leaves errors of 0.4 % and 0.1 % of the noise of a pixel. The centroid is the first moment of
+    the background-subtracted signal in a window that holds the spot and its blurred outline; the
     background is a cubic surface fitted around the window; single or paired hot and dead pixels are
     replaced by what their neighbours predict (but not a dead pixel right on a sharp outline, which
     moves the centroid of a disc of radius r by up to 1/(2πr) pixel). An isolated pixel that

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from os import PathLike
-from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -32,7 +31,7 @@ from equipix.hardware.words import (
     exponent_of,
 )
 from equipix.io import tiff
-from equipix.io.paths import as_path, reading, write_whole
+from equipix.io.paths import as_path, check_suffix, reading, write_whole
 from equipix.measured.colour import Colours
 
 _ADC_BITS = 14
@@ -349,7 +348,7 @@ class Table(RawCorrection, Content):
             with write_whole(path, force=force) as temporary:
                 tiff.write_frames(temporary, [self.gain], nbytes=0, description=text)
             return
-        encode_file, _ = _FORMATS[_suffix(file)]
+        encode_file, _ = _FORMATS[check_suffix(file, SUFFIXES)]
         data = encode_file(self, file.stem)
         with write_whole(path, force=force) as temporary:
             temporary.write_bytes(data)
@@ -412,17 +411,9 @@ def read_table(path: str | PathLike[str]) -> Table:
         version.
     """
     file = as_path("path", path)
-    _, decode_file = _FORMATS[_suffix(file)]
+    _, decode_file = _FORMATS[check_suffix(file, SUFFIXES)]
     with reading(file):
         return Table(**vars(decode_file(file, file.read_bytes())))
-
-
-def _suffix(path: Path) -> str:
-    suffix = path.suffix.lower()
-    if suffix not in _FORMATS:
-        wanted = ", ".join(SUFFIXES)
-        raise InputError(f"'{path}' ends in '{path.suffix}', expected the suffix {wanted}")
-    return suffix
 
 
 def adc_words(frames: ArrayLike, shape: tuple[int, ...]) -> Array:

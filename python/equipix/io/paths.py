@@ -87,6 +87,15 @@ def as_path(name: str, value: object) -> Path:
     return Path(text)
 
 
+def check_suffix(path: Path, suffixes: Iterable[str]) -> str:
+    """Return the suffix of a file, in small letters; `InputError` unless it is one of these."""
+    suffix = path.suffix.lower()
+    if suffix not in suffixes:
+        wanted = ", ".join(suffixes)
+        raise InputError(f"'{path}' ends in '{path.suffix}', expected the suffix {wanted}")
+    return suffix
+
+
 _TWO = "is named for two outputs: name another for one of them"
 
 

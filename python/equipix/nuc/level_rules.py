@@ -290,12 +290,12 @@ def _on_misfit(curves: Curves) -> str | None:
     levels = len(response.levels)
     limit = max(_MOST, 1 + SIGMAS * power["standard_error"]) if power else 0.0
     if power and power["ratio"] > limit:
-        auto = " or order auto" if order < levels - 2 else ""
+        auto = " or order='auto'" if order < levels - 2 else ""
         return (
             f"curves of order {order} do not follow the levels: their reduced chi-square is "
             f"{misfit:.3g}, and the variance of the next coefficient is {power['ratio']:.3g} times "
             f"that by noise (1 ± {power['standard_error']:.2g} of noise alone, limit {limit:.3g}): "
-            f"fit with order {order + 1}{auto}"
+            f"fit with order={order + 1}{auto}"
         )
     if not misfit > _MOST:
         return None
@@ -306,7 +306,7 @@ def _on_misfit(curves: Curves) -> str | None:
         higher = "no other order predicts levels that are left out better, so "
     elif order < 3:
         more = "fit with" if order < levels - 2 else "give more levels and fit with"
-        higher = f"{more} order {order + 1} or order auto, "
+        higher = f"{more} order={order + 1} or order='auto', "
     return (
         f"curves of order {order} leave half of the pixels a misfit of {misfit:.3g} or more times "
         f"that of noise: {higher}check that the source was steady and that the noise was as "

@@ -347,7 +347,9 @@ def _errors(calibration: Calibration) -> Table:
     """What the error of M is made of, known or not; error bars contain the drift."""
     std, tilt, drift = calibration.sensitivity_std, calibration.tilt_std, calibration.drift
     pixel = of_tilt = ("not known", _why_none(calibration))
-    lamp = ("not known", "in the tilt: the exposures do not determine it")
+    fitted = calibration.metadata["options"]["flux"] in ("fit", "prior")
+    why = "the fluxes were fitted" if fitted else "not estimated"
+    lamp = ("not known", f"in the tilt; {why}")
     if std is not None:
         variance = np.square(std, dtype=np.float64)
         if drift is not None:
