@@ -96,6 +96,12 @@ class TestKinds:
         with pytest.raises(errors.InputError, match="'frames' 99 and 100.* of two series or sens"):
             nuc.find_defects(response, stack)
 
+    def test_a_cosmic_ray_is_no_other_series(self, array, response):
+        stack = frames(array, 8e6, 100, 99).astype(np.float32)
+        stack[40, 4:10, 4:10] += 20000.0
+        stack[50:, 12, 12] += 4000.0
+        nuc.find_defects(response, stack)
+
     def test_averages_show_noise_but_no_flicker(self, array, response):
         average = equipix.average(frames(array, 8e6, 100, 99))
         found = nuc.find_defects(response, average)

@@ -40,6 +40,10 @@ class Steadiness(NamedTuple):
     """Noise of one frame of half of the pixels."""
 
 
+_OUTLYING = 0.1
+"""Share of pixels whose changes are none of the pattern: cosmic rays, telegraph noise."""
+
+
 class Temporal(NamedTuple):
     """Each pixel over time, the drift of the frame mean removed; NaN where a sample is missing."""
 
@@ -55,7 +59,8 @@ class Temporal(NamedTuple):
     drift: float
     """Standard deviation of the frame means."""
     changes: Floats
-    """Mean absolute difference of each two successive frames, of a part of many pixels."""
+    """Mean absolute difference of each two successive frames, of a part of many pixels, without the
+    largest ones."""
 
     @property
     def steadiness(self) -> Steadiness:
@@ -160,8 +165,10 @@ def temporal_of(stack: Frames, mask: Bools | None = None) -> Temporal:
                     steps[rows] += (free - (before[rows].astype(np.float64) - levels[-2])) ** 2
         if index > 1 and part.size:
             both = (each.reshape(-1)[part].astype(np.float64) for each in (frame, before))
-            change = np.subtract(*both) - (levels[-1] - levels[-2])
-            changes.append(float(np.abs(change).mean()))
+            change = np.subtract(*both)
+            change -= np.median(change)
+            kept = change.size - int(_OUTLYING * change.size)
+            changes.append(float(np.partition(np.abs(change), kept - 1)[:kept].mean()))
         before = frame
     squares /= len(levels) - 1
     mean += np.mean(levels)
