@@ -381,7 +381,7 @@ WRONG = {
     "moving beam": (moving_beam, r"check the shifts"),
     "breathing beam": (breathing_beam, r"illumination changes its shape"),
     "exposures mixed": (mixed, r"check the order of the frames"),
-    "exposure duplicated": (duplicated, r"exposures \d+ and \d+ are equal"),
+    "exposure duplicated": (duplicated, r"exposure .* and .* are equal"),
     "flicker": (flicker, r"common to the pixels of rows"),
     "fine speckle": (fine_speckle, r"finer than"),
 }

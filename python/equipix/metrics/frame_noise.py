@@ -164,11 +164,14 @@ def temporal_of(stack: Frames, mask: Bools | None = None) -> Temporal:
                 if index > 1:
                     steps[rows] += (free - (before[rows].astype(np.float64) - levels[-2])) ** 2
         if index > 1 and part.size:
-            both = (each.reshape(-1)[part].astype(np.float64) for each in (frame, before))
-            change = np.subtract(*both)
+            change = frame.reshape(-1)[part].astype(np.float32)
+            change -= before.reshape(-1)[part]
             change -= np.median(change)
+            np.abs(change, out=change)
             kept = change.size - int(_OUTLYING * change.size)
-            changes.append(float(np.partition(np.abs(change), kept - 1)[:kept].mean()))
+            change.partition(kept - 1)
+            changes.append(float(change[:kept].mean(dtype=np.float64)))
+            del change
         before = frame
     squares /= len(levels) - 1
     mean += np.mean(levels)

@@ -23,6 +23,9 @@ from equipix.nuc.response import Response, common_misfit
 _SAMPLED = 4096
 """Pixels that show the step between values."""
 
+_FEWEST_SAMPLED = 64
+"""Pixels of each of many frames."""
+
 _CORRELATED = 0.5
 """Correlation of successive frames from which flicker must be found."""
 
@@ -102,7 +105,8 @@ def of_frames(
         if not said:
             _refuse_series(over_time)
         mean, variance, steps, _, count, *_ = over_time
-        sampled = np.unravel_index(spread(good.size, _SAMPLED), good.shape)
+        pixels = max(_SAMPLED // count, _FEWEST_SAMPLED)
+        sampled = np.unravel_index(spread(good.size, pixels), good.shape)
         step = noise.step_of(np.array([frame[sampled] for frame in given]))
     if count < 2:
         raise InputError("'frames' holds one frame, expected two or more: one shows no noise")
