@@ -30,7 +30,7 @@ from PIL import Image
 import equipix
 from equipix import Flag, bolometer, hardware, lens, nuc, simulate
 from equipix._check import Array
-from equipix.errors import EquipixError, FileError, InputError
+from equipix.errors import EquipixError, FileError, InputError, InputWarning
 from equipix.exposures.positions import Orientation
 from equipix.findings import Finding, usable
 from equipix.io.formats import load_pages, refuse_saved, save_pages
@@ -334,7 +334,7 @@ def test_convert_writes_the_map_that_is_asked_for(tmp_path, run):
     assert run("convert", path, tmp_path / "a.tif", "--as", "gain", "--mean-one")[0] == 0
     wanted = KINDS["calibration"].viewed().exported("gain", mean_one=True).image
     np.testing.assert_array_equal(tifffile.imread(tmp_path / "a.tif"), wanted.astype(np.float32))
-    hardware.Table.of(KINDS["polynomial"], linearise=(500, 3000)).save(table)
+    table_of_lines().save(table)
     assert run("convert", table, tmp_path / "b.bin")[0] == 0
     assert differences(*map(equipix.load, (table, tmp_path / "b.bin"))) == []
     for source, target, option, words in (
@@ -395,8 +395,14 @@ def test_a_state_comes_back_bit_by_bit(tmp_path, name, suffix):
     assert differences(*states) == []
 
 
+def table_of_lines():
+    """A table of lines in place of curves, which says what they leave."""
+    with pytest.warns(InputWarning, match="'linearise'"):
+        return hardware.Table.of(KINDS["polynomial"], linearise=(500, 3000))
+
+
 def test_a_table_is_read_by_its_suffix(tmp_path):
-    table = hardware.Table.of(KINDS["polynomial"], linearise=(500, 3000))
+    table = table_of_lines()
     for suffix in (".bin", ".hex", ".h"):
         table.save(tmp_path / f"a{suffix}")
         assert differences(table, equipix.load(tmp_path / f"a{suffix}")) == []
@@ -551,7 +557,7 @@ def test_a_reader_of_one_kind_refuses_the_others(tmp_path):
 
 
 def test_inspect_shows_every_kind(tmp_path, run):
-    table = hardware.Table.of(KINDS["polynomial"], linearise=(500, 3000))
+    table = table_of_lines()
     for name, each in (KINDS | {"state": learned("kalman", SHAPE)}).items():
         each.save(tmp_path / f"{name}.npz")
         status, out, _ = run("inspect", tmp_path / f"{name}.npz", "--json")
