@@ -69,7 +69,33 @@ impl Precision for f64 {
         share: f64,
         control: &Control,
     ) -> Result<f64> {
-        system.multiply_double(x, product, share, control)
+        let cells = system.state.beam.len();
+        let params = system.fluxes.columns.len();
+        let moves = system.centred(&x[cells + params..]);
+        let beam = std::mem::take(&mut system.state.beam);
+        product.resize(cells, 0.0);
+        let sums = system.propagate(&beam, x, &moves, product, share, control);
+        system.state.beam = beam;
+        let sums = sums?;
+        system.append(&sums, product);
+        if let Some(penalty) = &system.penalty {
+            penalty.add_product(&x[..cells], &mut product[..cells], system.pass.workers);
+        }
+        let of_flux = product[cells..].iter_mut().zip(&x[cells..cells + params]);
+        for ((product, x), precision) in of_flux.zip(&system.fluxes.precisions) {
+            *product += system.unit * precision * x;
+        }
+        if let Some(prior) = &system.shift_prior {
+            let pulls = prior.pull(&moves);
+            let of_shifts = product[cells + params..].iter_mut().zip(pulls.as_flattened());
+            of_shifts.for_each(|(product, pull)| *product += system.unit * pull);
+        }
+        if !system.shift_noise.is_empty() {
+            let feigned = system.centred_pulls(system.feigned_pulls(&moves));
+            let of_shifts = product[cells + params..].iter_mut().zip(feigned.as_flattened());
+            of_shifts.for_each(|(product, feigned)| *product -= feigned);
+        }
+        Ok(sums.largest)
     }
 }
 
@@ -87,7 +113,17 @@ impl Precision for f32 {
         share: f64,
         control: &Control,
     ) -> Result<f64> {
-        system.multiply_single(x, product, share, control)
+        let Some(penalty) = &system.penalty else { return Ok(f64::INFINITY) };
+        let fused =
+            system.fused.get_or_insert_with(|| Fused::new(&system.pass, system.ordinary, control));
+        if !system.is_fused_anew {
+            system.pass.free_sums();
+            fused.renew(&system.pass, control);
+            control.check()?;
+            system.is_fused_anew = true;
+        }
+        product.resize(x.len(), 0.0);
+        fused.multiply(&mut system.pass, penalty, x, share, product, control)
     }
 }
 
@@ -383,62 +419,6 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     pub(crate) fn units<N: Precision>(&self) -> [f64; 2] {
         let [light, weight] = self.ordinary;
         N::units(light, weight)
-    }
-
-    fn multiply_double(
-        &mut self,
-        x: &[f64],
-        product: &mut Vec<f64>,
-        share: f64,
-        control: &Control,
-    ) -> Result<f64> {
-        let cells = self.state.beam.len();
-        let params = self.fluxes.columns.len();
-        let moves = self.centred(&x[cells + params..]);
-        let beam = std::mem::take(&mut self.state.beam);
-        product.resize(cells, 0.0);
-        let sums = self.propagate(&beam, x, &moves, product, share, control);
-        self.state.beam = beam;
-        let sums = sums?;
-        self.append(&sums, product);
-        if let Some(penalty) = &self.penalty {
-            penalty.add_product(&x[..cells], &mut product[..cells], self.pass.workers);
-        }
-        let of_flux = product[cells..].iter_mut().zip(&x[cells..cells + params]);
-        for ((product, x), precision) in of_flux.zip(&self.fluxes.precisions) {
-            *product += self.unit * precision * x;
-        }
-        if let Some(prior) = &self.shift_prior {
-            let pulls = prior.pull(&moves);
-            let of_shifts = product[cells + params..].iter_mut().zip(pulls.as_flattened());
-            of_shifts.for_each(|(product, pull)| *product += self.unit * pull);
-        }
-        if !self.shift_noise.is_empty() {
-            let feigned = self.centred_pulls(self.feigned_pulls(&moves));
-            let of_shifts = product[cells + params..].iter_mut().zip(feigned.as_flattened());
-            of_shifts.for_each(|(product, feigned)| *product -= feigned);
-        }
-        Ok(sums.largest)
-    }
-
-    fn multiply_single(
-        &mut self,
-        x: &[f32],
-        product: &mut Vec<f32>,
-        share: f64,
-        control: &Control,
-    ) -> Result<f64> {
-        let Some(penalty) = &self.penalty else { return Ok(f64::INFINITY) };
-        let fused =
-            self.fused.get_or_insert_with(|| Fused::new(&self.pass, self.ordinary, control));
-        if !self.is_fused_anew {
-            self.pass.free_sums();
-            fused.renew(&self.pass, control);
-            control.check()?;
-            self.is_fused_anew = true;
-        }
-        product.resize(x.len(), 0.0);
-        fused.multiply(&mut self.pass, penalty, x, share, product, control)
     }
 
     /// Whether products can be made in single precision.
