@@ -129,13 +129,13 @@ def test_response_curves_count_their_bytes():
     assert f"({needed} bytes)" in said.stdout, said.stdout + said.stderr
 
 
-CHILDREN = f"""
+CHILDREN = """
 import json, equipix, warnings
 warnings.simplefilter("ignore")
 frames = np.random.default_rng(0).uniform(1, 2, (5, 1500, 1500)).astype(np.float32)
 def peak():
     return 1024 * int(re.search(r"VmHWM:\\s+(\\d+)", open("/proc/self/status").read())[1])
-def calibrate(megabytes, turn):
+def calibrate(megabytes, shifts, options):
     \"\"\"By how much a child of this process grows that has so many megabytes, or its error.\"\"\"
     read, write = os.pipe()
     if child := os.fork():
@@ -143,35 +143,51 @@ def calibrate(megabytes, turn):
         with open(read) as answer:
             said = answer.read()
         return said if os.waitpid(child, 0)[1] == 0 else "died"
+    if options.pop("uneven"):
+        options["variance"] = 1 + frames
     limit(megabytes * 10**6)
     before = peak()
     try:
-        rotation = [0, 0, 0, 0, turn]
-        equipix.calibrate(frames, {CROSS.tolist()}, rotation=rotation, max_sweeps=9, workers=2)
+        equipix.calibrate(frames, shifts, max_sweeps=9, workers=2, **options)
         answer = str(peak() - before)
     except equipix.errors.InsufficientMemoryError as error:
         answer = str(error)
     os.write(write, answer.encode())
     os._exit(0)
-limits, turn = json.loads(sys.argv[1])
-print(json.dumps([calibrate(megabytes, turn) for megabytes in limits]))
+limits, shifts, options = json.loads(sys.argv[1])
+print(json.dumps([calibrate(megabytes, shifts, dict(options)) for megabytes in limits]))
 """
 
 
-def calibrations(limits, turn=0):
-    done = run(CHILDREN, json.dumps([limits, turn]))
-    return json.loads(done.stdout)
+def calibrations(limits, shifts=CROSS, *, uneven=False, **options):
+    given = [limits, shifts.tolist(), {"uneven": uneven, **options}]
+    return json.loads(run(CHILDREN, json.dumps(given)).stdout)
 
 
 @pytest.mark.parametrize("turn", [0, 90])
 def test_the_bytes_named_are_those_it_takes(turn):
     """All that is counted is used, and the allocator's share covers what is not."""
     allocator = 2**26
-    refused, grown = calibrations([60, 2000], turn)
+    refused, grown = calibrations([60, 2000], rotation=[0, 0, 0, 0, turn])
     words = r"calibrating 5 exposures of \(1500, 1500\) needs (.*) MB \((\d+) bytes\) beside its"
     short, needed = re.match(words, refused).groups()
     assert float(short) == pytest.approx(int(needed) / 1e6, abs=0.05)
     assert int(needed) - allocator <= int(grown) <= int(needed)
+
+
+@pytest.mark.parametrize(
+    "sought",
+    [
+        {},
+        {"uneven": True},
+        {"flux": "fit"},
+        {"rotation": [0, 0, 0, 0, 90]},
+    ],
+)
+def test_a_joint_fit_takes_no_more_bytes_than_it_names(sought):
+    refused, grown = calibrations([60, 4000], CROSS + 0.3 * (CROSS > 0), **sought)
+    words = r"fitting 5 exposures of \(1500, 1500\) jointly needs .* MB \((\d+) bytes\) beside its"
+    assert int(grown) <= int(re.match(words, refused)[1])
 
 
 def test_a_process_is_refused_or_finishes_whatever_its_limit():

@@ -155,10 +155,15 @@ def weighted_fit(exposures: Exposures, options: Options, start: Fit | None = Non
         rough = dataclasses.replace(options.fit, tolerance=tolerance)
         at_medians = (c * middle for c in exposures.flux.values)
         nearest = exposures.at(dataclasses.replace(exposures.positions.whole(), std=None))
-        start = modelled(nearest, at_medians).fit(rough, start)
-        exposures = modelled(exposures, expected(exposures, start, middle, options.fit.workers))
+        variances = np.empty_like(exposures.values)
+        start = modelled(nearest, at_medians, variances).fit(rough, start)
+        signals = expected(exposures, start, middle, options.fit.workers)
+        # Nothing is asked of the rough fit any more that would need its variances.
+        exposures = modelled(exposures, signals, variances)
+        del nearest, at_medians, variances, signals
+        if not options.robust:
+            middle = None
     fit = exposures.fit(options.fit, start)
-    # With the rough fit go the variances that it refers to.
     del start
     if options.robust:
         return _robust_fit(exposures, options.fit, fit, middle)
@@ -184,7 +189,8 @@ def _robust_fit(
             break
         returned |= former & ~out
         if middle is not None:
-            exposures = modelled(exposures, expected(exposures, fit, middle, options.workers))
+            signals = expected(exposures, fit, middle, options.workers)
+            exposures = modelled(exposures, signals, np.empty_like(exposures.values))
         kept = contradictory_found(exposures.without(~usable | out), given)
         fit = kept.fit(options, fit)
     return Weighted(kept, fit, out | (given & ~usable))
@@ -200,14 +206,15 @@ def contradictory_found(kept: Exposures, given: Bools) -> Exposures:
     return kept.marked(contradictory=union(kept.bad_pixels.contradictory, contradictory))
 
 
-def modelled(exposures: Exposures, signals: Iterator[Array]) -> Exposures:
-    """Exposures with the variances that their noise models have at these signals."""
-    models, like = exposures.noise, exposures.values
+def modelled(exposures: Exposures, signals: Iterator[Array], variances: Array) -> Exposures:
+    """Exposures with the variances that their noise models have at these signals, in that array."""
     if exposures.filters is None:
-        return exposures.weighted(modelled_variances(models, signals, like))
-    response = exposures.response  # the models are of values in DN
-    variances = modelled_variances(models, (signal * response for signal in signals), like)
-    return exposures.weighted(np.asarray(variances / np.square(response), like.dtype))
+        modelled_variances(exposures.noise, signals, variances)
+    else:  # the models are of values in DN
+        response = exposures.response
+        modelled_variances(exposures.noise, (signal * response for signal in signals), variances)
+        variances /= np.square(response)
+    return exposures.weighted(variances)
 
 
 def expected(

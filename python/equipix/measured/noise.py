@@ -366,19 +366,17 @@ def _of_line(
 
 
 def modelled_variances(
-    models: Sequence[NoiseModel], expected: Iterable[Array], like: Array
-) -> Array:
-    """Variance of every value of `like`, shape (n, rows, cols), where its model expects `expected`.
+    models: Sequence[NoiseModel], expected: Iterable[Array], variances: Array
+) -> None:
+    """Write the variance of every value, shape (n, rows, cols), where its model expects `expected`.
 
     Where no signal is expected the least variance is a millionth of the largest, so that a model
     without read noise gives a number there.
     """
-    variances = np.empty_like(like)
     for variance, model, signal in zip(variances, models, expected, strict=True):
         for rows in blocks(signal.shape):
             variance[rows] = model.variance(np.nan_to_num(signal[rows]))
         np.maximum(variance, _FLOOR * variance.max(), out=variance)
-    return variances
 
 
 def scatter_limit(frames: int, *, sigmas: float = 6.0) -> float:

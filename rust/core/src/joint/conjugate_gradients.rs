@@ -70,6 +70,11 @@ impl<N: Precision> ConjugateGradients<N> {
         Ok(())
     }
 
+    /// The solution, and what is known then.
+    pub(crate) fn found(self) -> (Vec<N>, Known) {
+        (self.x, self.known)
+    }
+
     /// Multiplies S by the direction; returns the largest relative change of M that goes with P⁻¹ r.
     pub(crate) fn product<T: Real>(
         &mut self,

@@ -1,6 +1,6 @@
 //! The arithmetic of a fused product along one row of pixels, in single precision.
 
-use super::kernel::AROUND;
+use super::kernel::{AROUND, Row};
 use crate::geometry::TAPS;
 
 /// Values side by side, which vector registers hold.
@@ -50,15 +50,6 @@ impl Ring {
     }
 }
 
-/// What is kept of a row of pixels: ê of each exposure, √(w/w₀) c of each measurement unless that is the
-/// same for an exposure, M², and what the change of M is of Σ ê v.
-pub(super) struct Pixels<'s> {
-    pub(super) units: &'s [f32],
-    pub(super) gains: Option<&'s [f32]>,
-    pub(super) square: &'s [f32],
-    pub(super) change: &'s [f32],
-}
-
 /// The values of a row from one place on. A closure would stay a call within the dispatched code.
 #[inline(always)]
 fn lanes(row: &[f32], start: usize) -> [f32; LANES] {
@@ -67,20 +58,46 @@ fn lanes(row: &[f32], start: usize) -> [f32; LANES] {
     values
 }
 
-/// What pixels see, v, and what they pull back once M has followed: with unit vectors ê along √w e over the
-/// exposures of a pixel, v → M² (v − ê Σ ê v). Returns the largest size of the change of M less a share of
-/// the change before.
+/// What pixels of a row see of a ring of rows of cells, of which the first tap takes number `index`.
+#[inline(always)]
+fn across(
+    ring: &Ring,
+    exposure: usize,
+    index: usize,
+    taps: [f32; TAPS],
+    start: usize,
+) -> [f32; LANES] {
+    let [s, t, u, v] = taps;
+    let a = lanes(ring.row(exposure, index), start);
+    let b = lanes(ring.row(exposure, index + 1), start);
+    let c = lanes(ring.row(exposure, index + 2), start);
+    let d = lanes(ring.row(exposure, index + 3), start);
+    let mut seen = [0.0; LANES];
+    for i in 0..LANES {
+        seen[i] = s * a[i] + t * b[i] + u * c[i] + v * d[i];
+    }
+    seen
+}
+
+/// What pixels see of the beam and of a change of it, l and v, and what they pull back once M has followed by
+/// −M α: v → M² (v − l α) with α = i Σ l v over the exposures of a pixel. Returns the largest size of the change of M
+/// less a share of the change before.
 pub(super) struct Eliminate<'s> {
-    /// Rows of cells as seen along the row of pixels, of which the first tap takes number `index`.
-    pub(super) seen: &'s Ring,
+    /// Rows of cells as seen along the row of pixels, of the beam and of its change, of which the first tap takes
+    /// number `index`.
+    pub(super) seen: [&'s Ring; 2],
     pub(super) index: usize,
     /// Taps along rows of each exposure.
     pub(super) taps: &'s [[f32; TAPS]],
-    pub(super) pixels: Pixels<'s>,
-    pub(super) last: &'s mut [f64],
+    /// √(w/w₀) c of each measurement, unless that is the same for an exposure and in its taps.
+    pub(super) gains: Option<&'s [f32]>,
+    /// M, its normal matrix and its last change.
+    pub(super) row: Row<'s>,
+    /// i times Σ w e².
+    pub(super) unit: f64,
     pub(super) share: f64,
-    /// Buffers for v of each exposure.
-    pub(super) values: &'s mut [[f32; LANES]],
+    /// Buffers for l and v of each exposure.
+    pub(super) values: &'s mut [[[f32; LANES]; 2]],
     /// The pulls of the row, of the same number.
     pub(super) pulls: &'s mut Ring,
 }
@@ -90,39 +107,40 @@ impl pulp::NullaryFnOnce for Eliminate<'_> {
 
     #[inline(always)]
     fn call(self) -> f64 {
-        let Self { seen, index, taps, pixels, last, share, values, pulls } = self;
-        let width = pixels.square.len();
+        let Self { seen, index, taps, gains, row, unit, share, values, pulls } = self;
+        let width = seen[0].width;
         let mut largest = [0.0_f64; LANES];
-        for (chunk, last) in last.chunks_mut(LANES).enumerate() {
+        let pixels = row.change.chunks_mut(LANES).zip(row.sensitivity.chunks(LANES));
+        for (chunk, ((last, m), inverse)) in pixels.zip(row.inverse.chunks(LANES)).enumerate() {
             let start = chunk * LANES;
             let mut along = [0.0; LANES];
-            for (k, (value, &[s, t, u, v])) in values.iter_mut().zip(taps).enumerate() {
-                let a = lanes(seen.row(k, index), start);
-                let b = lanes(seen.row(k, index + 1), start);
-                let c = lanes(seen.row(k, index + 2), start);
-                let d = lanes(seen.row(k, index + 3), start);
-                let unit = lanes(pixels.units, k * width + start);
-                for i in 0..LANES {
-                    value[i] = s * a[i] + t * b[i] + u * c[i] + v * d[i];
-                }
-                if let Some(gains) = pixels.gains {
+            for (k, ([level, value], &taps)) in values.iter_mut().zip(taps).enumerate() {
+                *level = across(seen[0], k, index, taps, start);
+                *value = across(seen[1], k, index, taps, start);
+                if let Some(gains) = gains {
                     let gain = lanes(gains, k * width + start);
                     for i in 0..LANES {
+                        level[i] *= gain[i];
                         value[i] *= gain[i];
                     }
                 }
                 for i in 0..LANES {
-                    along[i] += unit[i] * value[i];
+                    along[i] += level[i] * value[i];
                 }
             }
-            let square = lanes(pixels.square, start);
-            for (k, value) in values.iter().enumerate() {
-                let unit = lanes(pixels.units, k * width + start);
+            // Behind the last pixel M is 0.
+            let [mut sensitivity, mut square] = [[0.0; LANES]; 2];
+            for (i, (m, inverse)) in m.iter().zip(inverse).enumerate() {
+                along[i] *= (unit * inverse) as f32;
+                sensitivity[i] = *m as f32;
+                square[i] = sensitivity[i] * sensitivity[i];
+            }
+            for (k, [level, value]) in values.iter().enumerate() {
                 let mut pull = [0.0; LANES];
                 for i in 0..LANES {
-                    pull[i] = square[i] * (value[i] - unit[i] * along[i]);
+                    pull[i] = square[i] * (value[i] - level[i] * along[i]);
                 }
-                if let Some(gains) = pixels.gains {
+                if let Some(gains) = gains {
                     let gain = lanes(gains, k * width + start);
                     for i in 0..LANES {
                         pull[i] *= gain[i];
@@ -130,9 +148,8 @@ impl pulp::NullaryFnOnce for Eliminate<'_> {
                 }
                 pulls.row_mut(k, index)[AROUND + start..][..LANES].copy_from_slice(&pull);
             }
-            let factor = lanes(pixels.change, start);
             for (i, (last, largest)) in last.iter_mut().zip(&mut largest).enumerate() {
-                let change = f64::from(factor[i] * along[i]);
+                let change = f64::from(sensitivity[i] * along[i]);
                 // A maximum would lose what is no number, a minimum does not.
                 let size = (change + share * *last).abs().min(f64::INFINITY);
                 *largest = largest.max(size);

@@ -89,11 +89,10 @@ impl Lines {
     }
 }
 
-/// What is kept of a row of pixels from one linearisation on: the light c L that each exposure shows, M,
-/// the first element of the inverse of the normal matrix, the last change of M, and, where it is sought,
-/// the offset O with the other two elements.
+/// What is kept of a row of pixels from one linearisation on: M, the first element of the inverse of the normal
+/// matrix, the last change of M, and, where it is sought, the offset O with the other two elements. The light of
+/// each exposure follows from the beam.
 pub(crate) struct Row<'s> {
-    pub(crate) light: &'s mut [f64],
     pub(crate) sensitivity: &'s mut [f64],
     pub(crate) inverse: &'s mut [f64],
     pub(crate) change: &'s mut [f64],
@@ -103,15 +102,14 @@ pub(crate) struct Row<'s> {
 
 impl<'s> Row<'s> {
     /// Values that a row of `cols` pixels takes.
-    pub(crate) fn length(exposures: usize, cols: usize, with_offset: bool) -> usize {
-        (exposures + if with_offset { 6 } else { 3 }) * cols
+    pub(crate) const fn length(cols: usize, with_offset: bool) -> usize {
+        if with_offset { 6 * cols } else { 3 * cols }
     }
 
     /// The same row for a shorter time.
     pub(crate) fn again(&mut self) -> Row<'_> {
         let [offset, i12, i22] = &mut self.offset;
         Row {
-            light: self.light,
             sensitivity: self.sensitivity,
             inverse: self.inverse,
             change: self.change,
@@ -119,12 +117,10 @@ impl<'s> Row<'s> {
         }
     }
 
-    pub(crate) fn of(values: &'s mut [f64], exposures: usize, cols: usize) -> Self {
-        let (light, rest) = values.split_at_mut(exposures * cols);
-        let mut parts = rest.chunks_exact_mut(cols);
+    pub(crate) fn of(values: &'s mut [f64], cols: usize) -> Self {
+        let mut parts = values.chunks_exact_mut(cols);
         let mut next = || parts.next().unwrap_or_default();
         Self {
-            light,
             sensitivity: next(),
             inverse: next(),
             change: next(),
@@ -145,6 +141,8 @@ impl<'s> Row<'s> {
 pub(crate) struct Eliminate<'s> {
     pub(crate) row: Row<'s>,
     pub(crate) fluxes: &'s [f64],
+    /// c L of each exposure.
+    pub(crate) light: &'s [f64],
     pub(crate) weights: &'s [f64],
     /// y, then the pull.
     pub(crate) values: &'s mut Lines,
@@ -164,7 +162,7 @@ impl pulp::NullaryFnOnce for Eliminate<'_> {
 
     #[inline(always)]
     fn call(self) -> f64 {
-        let Row { light, sensitivity, inverse, offset: [offset, i12, i22], .. } = self.row;
+        let Row { sensitivity, inverse, offset: [offset, i12, i22], .. } = self.row;
         let cols = sensitivity.len();
         let with_offset = !offset.is_empty();
         let [along, e, one, alone] = self.sums.each_mut().map(|sums| &mut sums[..cols]);
@@ -172,7 +170,7 @@ impl pulp::NullaryFnOnce for Eliminate<'_> {
             sums.fill(0.0);
         }
         for k in 0..self.fluxes.len() {
-            let (light, weights) = (of(light, k, cols), of(self.weights, k, cols));
+            let (light, weights) = (of(self.light, k, cols), of(self.weights, k, cols));
             let values = self.values.of(k);
             for col in 0..cols {
                 let we = weights[col] * light[col];
@@ -209,7 +207,7 @@ impl pulp::NullaryFnOnce for Eliminate<'_> {
         }
         let mut objective = 0.0;
         for (k, flux) in self.fluxes.iter().enumerate() {
-            let (light, weights) = (of(light, k, cols), of(self.weights, k, cols));
+            let (light, weights) = (of(self.light, k, cols), of(self.weights, k, cols));
             let values = self.values.of_mut(k);
             for col in 0..cols {
                 values[col] -= light[col] * sensitivity[col];
@@ -246,6 +244,8 @@ fn sum(values: &[f64]) -> f64 {
 pub(crate) struct Propagate<'s> {
     pub(crate) row: Row<'s>,
     pub(crate) fluxes: &'s [f64],
+    /// c L of each exposure.
+    pub(crate) light: &'s [f64],
     pub(crate) weights: &'s [f64],
     /// v, then the pull.
     pub(crate) values: &'s mut Lines,
@@ -260,14 +260,14 @@ impl pulp::NullaryFnOnce for Propagate<'_> {
 
     #[inline(always)]
     fn call(self) -> f64 {
-        let Row { light, sensitivity, inverse, change, offset: [offset, i12, i22] } = self.row;
+        let Row { sensitivity, inverse, change, offset: [offset, i12, i22] } = self.row;
         let cols = sensitivity.len();
         let with_offset = !offset.is_empty();
         let [along, alone, ..] = self.sums.each_mut().map(|sums| &mut sums[..cols]);
         along.fill(0.0);
         alone.fill(0.0);
         for (k, flux) in self.fluxes.iter().enumerate() {
-            let (light, weights) = (of(light, k, cols), of(self.weights, k, cols));
+            let (light, weights) = (of(self.light, k, cols), of(self.weights, k, cols));
             let values = self.values.of_mut(k);
             for col in 0..cols {
                 values[col] *= flux * sensitivity[col];
@@ -288,7 +288,7 @@ impl pulp::NullaryFnOnce for Propagate<'_> {
             }
         }
         for (k, flux) in self.fluxes.iter().enumerate() {
-            let (light, weights) = (of(light, k, cols), of(self.weights, k, cols));
+            let (light, weights) = (of(self.light, k, cols), of(self.weights, k, cols));
             let values = self.values.of_mut(k);
             for col in 0..cols {
                 let left = values[col] - along[col] * light[col] - alone[col];

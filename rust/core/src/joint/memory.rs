@@ -9,22 +9,28 @@ use crate::frames::Real;
 ///
 /// | array | in bytes |
 /// |---|---|
-/// | the light of each measurement, and for products in single precision a unit and a gain | 8 + 4 + 4 |
-/// | M, its normal matrix, its change; O and two more elements; M² and a factor in single precision | 32 or 48 for each pixel |
-/// | the sums of all bands (`pass.rs`, `fused.rs`) | 12 · 2.2 at most for each cell of each view |
-/// | the beam, four vectors of a search, weights, the penalty, the preconditioner, slopes, the last step and its slope | 8 · 17 for each cell |
-/// | with turned exposures, the beam and a vector in each view, and what was found there | 24 for each cell of each view |
+/// | M, its normal matrix, its change; O and two more elements | 24 or 48 for each pixel |
+/// | the beam, weights, their multiple of it, the penalty, the preconditioner | 50 for each cell |
+/// | while products are in single precision: a gain of each measurement | 4 |
+/// | … the sums of all bands in both precisions (`pass.rs`, `fused.rs`), the beam, slopes, the last step | 12 · 2.2 at most + 28 for each cell |
+/// | while they are in double precision: four vectors of a search, slopes, the last step and its slope | 64 for each cell |
+/// | … the sums of all bands | 8 · 2.2 at most for each cell of each view |
+/// | … with turned exposures, the beam and a vector in each view, and what was found there | 24 for each cell of each view |
 /// | the rim and its factor | some 2000 for each of its cells, [`WIDEST`] of each row and column at most |
-/// | the result and its components | 30 for each pixel, 21 for each cell |
+///
+/// The result takes less than what is freed before it is made.
 pub(crate) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>) -> u64 {
     let geometry = exposures.geometry();
     let (pixels, cells) = (geometry.sensor.len() as u64, geometry.beam.len() as u64);
     let (count, views) = (exposures.count() as u64, geometry.views.len() as u64);
-    let of_pixel = if exposures.offset() { 8 * count + 48 } else { 16 * count + 32 } + 30;
+    let of_pixel = if exposures.offset() { 48 } else { 24 };
     let turned = if views > 1 { 24 * views } else { 0 };
+    let single = 4 * count * pixels + 55 * cells;
+    let double = (64 + 18 * views + turned) * cells;
     let rim = 2000 * WIDEST as u64 * (geometry.beam.rows + geometry.beam.cols) as u64;
     of_pixel * pixels
-        + (27 * views + turned + 161) * cells
+        + 50 * cells
+        + single.max(double)
         + rim
         + coarse::bytes_needed(geometry, MOST_WAVES)
 }

@@ -66,7 +66,7 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
         control: &Control,
     ) -> Self {
         let (sensor, with_offset) = (exposures.sensor(), exposures.offset());
-        let length = Row::length(exposures.count(), sensor.cols, with_offset);
+        let length = Row::length(sensor.cols, with_offset);
         Self {
             exposures,
             workers,
@@ -97,16 +97,17 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
         self.sums = Vec::new();
     }
 
-    /// Calls `work` for each row of pixels, which leaves the pull of each exposure in the workspace's values,
-    /// and the slopes of the beam if shifts are sought; finds what `cells` get of them.
+    /// Calls `work` for each row of pixels with the beam's light there, and with its slopes if shifts are sought;
+    /// `work` leaves the pull of each exposure in the workspace's values; finds what `cells` get of them.
     pub(crate) fn run(
         &mut self,
+        beam: &[f64],
         cells: &mut [f64],
         control: &Control,
         work: impl Fn(&Self, usize, Row<'_>, &mut Workspace, &mut Sums) + Sync,
     ) -> Result<Sums> {
         let (sensor, count) = (self.exposures.sensor(), self.exposures.count());
-        let length = Row::length(count, sensor.cols, self.with_offset);
+        let length = Row::length(sensor.cols, self.with_offset);
         let mut rows = std::mem::take(&mut self.rows);
         let mut sums = std::mem::take(&mut self.sums);
         let size = self.bands.size(sensor.rows);
@@ -115,6 +116,7 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
             sums = self.workers.filled(size, 0.0, control);
         }
         let (pass, height) = (&*self, self.bands.height);
+        let beams = pass.views_of(beam);
         let sizes = [height * length, self.bands.length];
         let bands = pass.workers.map_pairs(&mut rows, &mut sums, sizes, |band, rows, strips| {
             let mut workspace = pass.workspace();
@@ -127,13 +129,13 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
                     break;
                 }
                 workspace.lines.rotate_left(1);
-                let parts = Row::of(row, count, sensor.cols);
                 let number = band * height + index;
-                work(pass, number, parts, &mut workspace, &mut found);
+                pass.see_beam(&beams, number, &mut workspace);
+                work(pass, number, Row::of(row, sensor.cols), &mut workspace, &mut found);
                 if !pass.few_pull {
                     workspace.values().silence(pass.few.in_row(number), count);
                 }
-                pass.gather(row, &mut workspace, &mut found);
+                pass.gather(&workspace, &mut found);
                 pass.spread(index, &mut workspace, strips);
             }
             for index in last..last + pass.grid.width - 1 {
@@ -143,6 +145,7 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
             }
             found
         });
+        drop(beams);
         (self.rows, self.sums) = (rows, sums);
         self.count += 1;
         control.check()?;
@@ -166,12 +169,12 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
     }
 
     /// The pulls of a row at fluxes and shifts.
-    fn gather(&self, row: &[f64], workspace: &mut Workspace, found: &mut Sums) {
+    fn gather(&self, workspace: &Workspace, found: &mut Sums) {
         let cols = self.exposures.sensor().cols;
         for (k, flux) in self.flux.iter().enumerate() {
             let pull = workspace.lines[TAPS - 1].of(k);
             if self.with_flux {
-                found.flux[k] += dot(&row[k * cols..][..cols], pull) / flux;
+                found.flux[k] += dot(&workspace.light[k * cols..][..cols], pull) / flux;
             }
             if let Some(found) = found.shifts.get_mut(k) {
                 for (found, slopes) in found.iter_mut().zip(&workspace.slopes) {
@@ -278,6 +281,19 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
         Combine { rows, along_rows, along_cols, line, sums: seen }.dispatch();
     }
 
+    /// The light c L that one pixel sees of the beam.
+    pub(crate) fn light_at(&self, beam: &[f64], exposure: usize, [row, col]: [usize; 2]) -> f64 {
+        let window = &self.windows[exposure];
+        let cells = &self.grid.geometry.views[window.view].cells;
+        let mut light = 0.0;
+        for (i, down) in window.along_rows.values[..self.grid.width].iter().enumerate() {
+            for (j, along) in window.along_cols.values[..self.grid.width].iter().enumerate() {
+                light += down * along * beam[cells.at(row + window.row + i, col + window.col + j)];
+            }
+        }
+        self.flux[exposure] * light
+    }
+
     /// What the pixels of a row see of values on cells, added to the workspace's values.
     pub(crate) fn see(&self, views: &Views<'_>, row: usize, workspace: &mut Workspace) {
         for (k, window) in self.windows.iter().enumerate() {
@@ -287,10 +303,19 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
         }
     }
 
-    /// The slopes along both axes of the beam that the pixels of a row see, left in the workspace, where shifts
-    /// are sought.
-    pub(crate) fn see_slopes(&self, views: &Views<'_>, row: usize, workspace: &mut Workspace) {
+    /// The light c L of each exposure that the pixels of a row see of the beam, left in the workspace, and its
+    /// slopes along both axes of the beam where shifts are sought.
+    pub(crate) fn see_beam(&self, views: &Views<'_>, row: usize, workspace: &mut Workspace) {
         let cols = self.exposures.sensor().cols;
+        let Workspace { light, line, .. } = workspace;
+        light.fill(0.0);
+        for ((window, light), flux) in
+            self.windows.iter().zip(light.chunks_exact_mut(cols)).zip(&self.flux)
+        {
+            let taps = [window.along_rows.values, window.along_cols.values];
+            self.interpolate(views, window, row, taps, line, light);
+            light.iter_mut().for_each(|light| *light *= flux);
+        }
         for (axis, slopes) in workspace.slopes.iter_mut().enumerate() {
             slopes.fill(0.0);
             for (window, slopes) in self.windows.iter().zip(slopes.chunks_exact_mut(cols)) {
@@ -352,6 +377,7 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
         let weight = |k| self.exposures.uniform_weight(k).unwrap_or(0.0);
         Workspace {
             weights: (0..count).flat_map(|k| std::iter::repeat_n(weight(k), cols)).collect(),
+            light: vec![0.0; count * cols],
             lines: [(); TAPS].map(|()| Lines::new(count, cols)),
             line: vec![0.0; cols + 2 * AROUND],
             sums: [(); 4].map(|()| vec![0.0; cols]),
@@ -362,17 +388,16 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
     /// Calls `visit([M, i₁₁, the last change of M, O, i₁₂, i₂₂])` for each row of pixels, i being the
     /// inverse of their normal matrices; the last three are empty where no offset is sought.
     pub(crate) fn for_rows(&self, mut visit: impl FnMut([&[f64]; 6])) {
-        let (cols, count) = (self.exposures.sensor().cols, self.exposures.count());
-        for row in self.rows.chunks_exact(Row::length(count, cols, self.with_offset)) {
-            let part = |index: usize| row.chunks_exact(cols).nth(count + index).unwrap_or_default();
+        let cols = self.exposures.sensor().cols;
+        for row in self.rows.chunks_exact(Row::length(cols, self.with_offset)) {
+            let part = |index: usize| row.chunks_exact(cols).nth(index).unwrap_or_default();
             visit([0, 1, 2, 3, 4, 5].map(part));
         }
     }
 
-    /// What is kept of one row of pixels: the light of each exposure, then M and the rest.
+    /// What is kept of one row of pixels: M and the rest.
     pub(crate) fn row(&self, index: usize) -> &[f64] {
-        let (cols, count) = (self.exposures.sensor().cols, self.exposures.count());
-        let length = Row::length(count, cols, self.with_offset);
+        let length = Row::length(self.exposures.sensor().cols, self.with_offset);
         &self.rows[index * length..][..length]
     }
 }

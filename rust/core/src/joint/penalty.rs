@@ -2,8 +2,8 @@
 //!
 //! It determines what the measurements do not: a spline's finest pattern, and its cells behind the edge.
 //! Differences count where all five cells are seen. Since the beam has no scale of its own, the
-//! penalty acts on what differs from the beam's multiples, in the metric of its weights D:
-//! P x = x − a (aᵀD x)/(aᵀD a); otherwise it would pull the beam to 0 and M up.
+//! penalty acts on what differs from the beam's multiples, in the metric of its weights D: P x = x − a (s·x) with
+//! s = D a/(aᵀD a); otherwise it would pull the beam to 0 and M up.
 
 use crate::control::Control;
 use crate::frames::Shape;
@@ -25,9 +25,6 @@ pub(crate) struct Penalty {
     pub(crate) tau: f64,
     /// 1 where the five cells from here on count, down a column and along a row; else 0.
     counted: [Vec<u8>; 2],
-    /// D a and aᵀ D a.
-    pub(super) pull: Vec<f64>,
-    norm: f64,
     /// GᵀG a and ‖G a‖².
     pub(super) bent: Vec<f64>,
     energy: f64,
@@ -43,7 +40,6 @@ impl Penalty {
         control: &Control,
     ) -> Self {
         let Shape { rows, cols } = shape;
-        let zeros = || workers.filled(shape.len(), 0.0, control);
         let count = |width: usize, height: usize, step: usize| {
             let mut counted = workers.filled(shape.len(), 0, control);
             workers.map_blocks(&mut counted, cols, |row, counted| {
@@ -57,8 +53,8 @@ impl Penalty {
         };
         let counted =
             [count(cols, rows.saturating_sub(4), cols), count(cols.saturating_sub(4), rows, 1)];
-        let (pull, bent) = (zeros(), zeros());
-        Self { shape, tau, counted, pull, norm: 0.0, bent, energy: 0.0 }
+        let bent = workers.filled(shape.len(), 0.0, control);
+        Self { shape, tau, counted, bent, energy: 0.0 }
     }
 
     /// Counts also where another penalty does; returns whether it now counts where the other one does not.
@@ -80,14 +76,9 @@ impl Penalty {
         found
     }
 
-    /// Takes the beam a of weights D that its multiples are free of.
-    pub(crate) fn turn_to(&mut self, beam: &[f64], weights: &[f64], workers: &Workers) {
+    /// Takes the beam a that its multiples are free of.
+    pub(crate) fn turn_to(&mut self, beam: &[f64], workers: &Workers) {
         let cols = self.shape.cols;
-        workers.map_blocks(&mut self.pull, cols, |row, pull| {
-            let cells = weights[row * cols..].iter().zip(&beam[row * cols..]);
-            pull.iter_mut().zip(cells).for_each(|(pull, (d, a))| *pull = d * a);
-        });
-        self.norm = workers.dot(&self.pull, beam);
         let mut bent = std::mem::take(&mut self.bent);
         workers.map_blocks(&mut bent, cols, |_, bent| bent.fill(0.0));
         self.add_curvature(beam, 1.0, &mut bent, workers);
@@ -96,32 +87,43 @@ impl Penalty {
     }
 
     /// Takes τ Pᵀ GᵀG a from a slope; returns τ ‖G a‖².
-    pub(crate) fn pull(&self, slope: &mut [f64], workers: &Workers) -> f64 {
+    pub(crate) fn pull(&self, scale: &[f64], slope: &mut [f64], workers: &Workers) -> f64 {
         workers.add_multiple(slope, -self.tau, &self.bent);
-        workers.add_multiple(slope, self.tau * self.energy / self.norm, &self.pull);
+        workers.add_multiple(slope, self.tau * self.energy, scale);
         self.tau * self.energy
     }
 
     /// Adds τ Pᵀ GᵀG P x to `sums`.
-    pub(crate) fn add_product(&self, x: &[f64], sums: &mut [f64], workers: &Workers) {
-        let [bent, pull] = self.multiples(workers.dot(&self.pull, x), workers.dot(&self.bent, x));
+    pub(crate) fn add_product(
+        &self,
+        x: &[f64],
+        scale: &[f64],
+        sums: &mut [f64],
+        workers: &Workers,
+    ) {
+        let multiples = self.multiples(x, scale, workers);
         self.add_curvature(x, self.tau, sums, workers);
-        workers.add_multiple(sums, -bent, &self.bent);
-        workers.add_multiple(sums, -pull, &self.pull);
+        for (multiple, of) in multiples.into_iter().zip([&self.bent, scale]) {
+            workers.add_multiple(sums, -multiple, of);
+        }
     }
 
-    /// The multiples of GᵀG a and of D a that P takes off τ GᵀG x, for the products of x with D a and with
-    /// GᵀG a.
-    pub(super) fn multiples(&self, pull: f64, bent: f64) -> [f64; 2] {
-        let scale = pull / self.norm;
-        let back = (bent - scale * self.energy) / self.norm;
-        [scale * self.tau, back * self.tau]
+    /// The multiples of GᵀG a and of s that P takes off τ GᵀG x.
+    pub(super) fn multiples<N: Value>(
+        &self,
+        x: &[N],
+        scale: &[f64],
+        workers: &Workers,
+    ) -> [f64; 2] {
+        let (multiple, bent) = (workers.dot(scale, x), workers.dot(&self.bent, x));
+        [multiple, bent - multiple * self.energy].map(|multiple| multiple * self.tau)
     }
 
     /// Adds √τ Pᵀ Gᵀ s, whose covariance is that of the penalty, for signs s.
     pub(crate) fn add_draw(
         &self,
         beam: &[f64],
+        scale: &[f64],
         mut sign: impl FnMut() -> f64,
         sums: &mut [f64],
         workers: &Workers,
@@ -135,8 +137,8 @@ impl Penalty {
                 }
             }
         }
-        let scale = workers.dot(beam, &drawn) / self.norm;
-        workers.add_multiple(&mut drawn, -scale, &self.pull);
+        let multiple = workers.dot(beam, &drawn);
+        workers.add_multiple(&mut drawn, -multiple, scale);
         workers.add_multiple(sums, self.tau.sqrt(), &drawn);
     }
 
@@ -261,6 +263,12 @@ impl<N: Value> pulp::NullaryFnOnce for Bend<'_, N> {
 mod tests {
     use super::*;
 
+    /// D a/(aᵀD a).
+    fn scale(beam: &[f64], weights: &[f64]) -> Vec<f64> {
+        let norm: f64 = weights.iter().zip(beam).map(|(d, a)| d * a * a).sum();
+        weights.iter().zip(beam).map(|(d, a)| d * a / norm).collect()
+    }
+
     #[test]
     fn cells_out_of_sight_stay_in_it() {
         let (shape, workers) = (Shape::new(9, 11), Workers::new(None).unwrap());
@@ -286,10 +294,11 @@ mod tests {
         weights[0] = 0.0;
         let workers = Workers::new(None).unwrap();
         let mut penalty = Penalty::new(shape, &weights, 1.0, &workers, &Control::default());
-        penalty.turn_to(&beam, &weights, &workers);
+        penalty.turn_to(&beam, &workers);
+        let scale = scale(&beam, &weights);
         let product = |x: &[f64]| {
             let mut sums = vec![0.0; 99];
-            penalty.add_product(x, &mut sums, &workers);
+            penalty.add_product(x, &scale, &mut sums, &workers);
             sums
         };
         let energy = |x: &[f64]| product(x).iter().zip(x).map(|(s, x)| s * x).sum::<f64>();
@@ -314,16 +323,17 @@ mod tests {
         let (beam, x, y): (Vec<f64>, Vec<f64>, Vec<f64>) = (random(1.7), random(2.9), random(4.1));
         let workers = Workers::new(None).unwrap();
         let mut penalty = Penalty::new(shape, &[1.0; 56], 0.7, &workers, &Control::default());
-        penalty.turn_to(&beam, &[1.0; 56], &workers);
+        penalty.turn_to(&beam, &workers);
+        let scale = scale(&beam, &[1.0; 56]);
         let product = |x: &[f64]| {
             let mut sums = vec![0.0; 56];
-            penalty.add_product(x, &mut sums, &workers);
+            penalty.add_product(x, &scale, &mut sums, &workers);
             sums
         };
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
         let (ax, ay) = (product(&x), product(&y));
         let mut relative = x.clone();
-        let multiple = dot(&penalty.pull, &x) / penalty.norm;
+        let multiple = dot(&scale, &x);
         relative.iter_mut().zip(&beam).for_each(|(x, a)| *x -= multiple * a);
         let mut bent = vec![0.0; 56];
         penalty.add_curvature(&relative, 0.7, &mut bent, &workers);
@@ -337,6 +347,7 @@ mod tests {
     struct Dense {
         penalty: Penalty,
         beam: Vec<f64>,
+        scale: Vec<f64>,
         differences: Vec<Vec<f64>>,
         relative: Vec<Vec<f64>>,
         workers: Workers,
@@ -370,8 +381,9 @@ mod tests {
             let workers = Workers::new(None).unwrap();
             let control = Control::default();
             let mut penalty = Penalty::new(Self::SHAPE, &weights, Self::TAU, &workers, &control);
-            penalty.turn_to(&beam, &weights, &workers);
-            Self { penalty, beam, differences, relative, workers }
+            penalty.turn_to(&beam, &workers);
+            let scale = scale(&beam, &weights);
+            Self { penalty, beam, scale, differences, relative, workers }
         }
 
         /// G P, whose square times τ is the matrix of the penalty.
@@ -400,7 +412,7 @@ mod tests {
         for cell in 0..42 {
             let (mut unit, mut product) = (vec![0.0; 42], vec![0.0; 42]);
             unit[cell] = 1.0;
-            dense.penalty.add_product(&unit, &mut product, &dense.workers);
+            dense.penalty.add_product(&unit, &dense.scale, &mut product, &dense.workers);
             for (other, value) in product.iter().enumerate() {
                 assert!((value - square(&rows, cell, other)).abs() < ROUNDING);
             }
@@ -411,7 +423,7 @@ mod tests {
             .map(|line| line.iter().zip(beam).map(|(g, a)| g * a).sum())
             .collect();
         let mut slope = vec![0.0; 42];
-        let objective = dense.penalty.pull(&mut slope, &dense.workers);
+        let objective = dense.penalty.pull(&dense.scale, &mut slope, &dense.workers);
         let energy: f64 = bent.iter().map(|difference| difference * difference).sum();
         assert!((objective - Dense::TAU * energy).abs() < ROUNDING);
         for (cell, slope) in slope.iter().enumerate() {
@@ -429,7 +441,7 @@ mod tests {
             .map(|drawn| {
                 let (mut number, mut sums) = (0..rows.len(), vec![0.0; 42]);
                 let sign = || if number.next() == Some(drawn) { 1.0 } else { 0.0 };
-                dense.penalty.add_draw(&dense.beam, sign, &mut sums, &dense.workers);
+                dense.penalty.add_draw(&dense.beam, &dense.scale, sign, &mut sums, &dense.workers);
                 sums
             })
             .collect();

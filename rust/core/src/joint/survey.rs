@@ -27,9 +27,8 @@ impl<T: Real> System<'_, '_, T> {
             for row_index in block_row * size[0]..sensor.rows.min((block_row + 1) * size[0]) {
                 control.check()?;
                 let row = self.pass.row(row_index);
-                let (light, rest) = row.split_at(count * sensor.cols);
                 self.pass.weigh_row(row_index, &mut workspace);
-                self.pass.see_slopes(&beams, row_index, &mut workspace);
+                self.pass.see_beam(&beams, row_index, &mut workspace);
                 for k in 0..count {
                     let mut few = self.pass.few.in_row(row_index).iter().peekable();
                     for col in 0..sensor.cols {
@@ -39,7 +38,7 @@ impl<T: Real> System<'_, '_, T> {
                         let at = k * sensor.cols + col;
                         let block = &mut found[col / size[1] * count + k];
                         let (weight, light) =
-                            (workspace.weights[at] * rest[col].powi(2), light[at]);
+                            (workspace.weights[at] * row[col].powi(2), workspace.light[at]);
                         block.weight += weight * light * light;
                         for (axis, slopes) in workspace.slopes.iter().enumerate() {
                             let Some(slope) = slopes.get(at) else { continue };

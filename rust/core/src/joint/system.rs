@@ -72,14 +72,12 @@ impl Precision for f64 {
         let cells = system.state.beam.len();
         let params = system.fluxes.columns.len();
         let moves = system.centred(&x[cells + params..]);
-        let beam = std::mem::take(&mut system.state.beam);
         product.resize(cells, 0.0);
-        let sums = system.propagate(&beam, x, &moves, product, share, control);
-        system.state.beam = beam;
-        let sums = sums?;
+        let sums = system.propagate(x, &moves, product, share, control)?;
         system.append(&sums, product);
         if let Some(penalty) = &system.penalty {
-            penalty.add_product(&x[..cells], &mut product[..cells], system.pass.workers);
+            let product = &mut product[..cells];
+            penalty.add_product(&x[..cells], &system.scale, product, system.pass.workers);
         }
         let of_flux = product[cells..].iter_mut().zip(&x[cells..cells + params]);
         for ((product, x), precision) in of_flux.zip(&system.fluxes.precisions) {
@@ -117,13 +115,12 @@ impl Precision for f32 {
         let fused =
             system.fused.get_or_insert_with(|| Fused::new(&system.pass, system.ordinary, control));
         if !system.is_fused_anew {
-            system.pass.free_sums();
-            fused.renew(&system.pass, control);
+            fused.renew(&system.state.beam, system.pass.workers);
             control.check()?;
             system.is_fused_anew = true;
         }
         product.resize(x.len(), 0.0);
-        fused.multiply(&mut system.pass, penalty, x, share, product, control)
+        fused.multiply(&mut system.pass, (penalty, &system.scale), x, share, product, control)
     }
 }
 
@@ -139,14 +136,14 @@ pub(crate) struct System<'m, 'a, T> {
     /// The variance of a measurement of weight 1.
     pub(crate) unit: f64,
     pub(crate) state: State,
-    /// What the measurements pull at the unknowns there.
+    /// What the measurements pull at the unknowns there, while it may be asked for again.
     pull: Vec<f64>,
     /// The mean M of the pixels with measurements.
     pub(crate) mean: f64,
     /// Σ w c² M² of the pixels that see a cell, by their factors.
     pub(crate) weights: Vec<f64>,
     /// D a/(aᵀD a) with these weights D and the coefficients a.
-    pub(super) scale: Vec<f64>,
+    pub(crate) scale: Vec<f64>,
     pub(crate) penalty: Option<Penalty>,
     /// A faster product where it serves, and whether it is of the state last linearised.
     fused: Option<Fused>,
@@ -260,11 +257,8 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         self.fused.take_if(|_| self.shift_prior.is_some());
         (self.is_fused_anew, self.is_weighed_anew) = (false, false);
         self.pass.flux = self.fluxes.at(&self.state.theta);
-        let beam = std::mem::take(&mut self.state.beam);
-        let mut pull = self.pass.workers.filled(beam.len(), 0.0, control);
-        let found = self.eliminate_pixels(&beam, &mut pull, control);
-        self.state.beam = beam;
-        let found = found?;
+        let mut pull = self.pass.workers.filled(self.state.beam.len(), 0.0, control);
+        let found = self.eliminate_pixels(&mut pull, control)?;
         self.append(&found, &mut pull);
         (self.misfit, self.pull) = (found.objective, pull);
         self.of_prior = self.misfit_of_prior();
@@ -272,6 +266,9 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         // Cells come into sight where shifts move.
         if self.weights.is_empty() || self.shift_prior.is_some() {
             self.weigh(control)?;
+        }
+        if self.has_single() {
+            self.pass.free_sums();
         }
         self.whole(control)
     }
@@ -286,38 +283,42 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         self.whole(control)
     }
 
+    /// Frees what products take.
+    pub(crate) fn free_products(&mut self) {
+        self.fused = None;
+        self.pass.free_sums();
+    }
+
+    /// Frees what [`renew`](Self::renew) takes.
+    pub(crate) fn settle(&mut self) {
+        self.pull = Vec::new();
+    }
+
     /// M and O at their closed forms, and what they leave pulls at the cells.
-    fn eliminate_pixels(
-        &mut self,
-        beam: &[f64],
-        pull: &mut [f64],
-        control: &Control,
-    ) -> Result<Sums> {
-        let views = self.pass.views_of(beam);
+    fn eliminate_pixels(&mut self, pull: &mut [f64], control: &Control) -> Result<Sums> {
         let cols = self.pass.exposures.sensor().cols;
         let of_row = |row: usize| {
             let weights = self.prior.as_ref().map(|prior| &prior.weights[row * cols..][..cols]);
             weights.unwrap_or_default()
         };
         let mean = self.prior.as_ref().map_or(1.0, |prior| prior.mean);
-        self.pass.run(pull, control, |pass, row_index, row, workspace, found| {
-            workspace.values().clear();
-            pass.see(&views, row_index, workspace);
-            let lights = row.light.chunks_exact_mut(pass.exposures.sensor().cols);
-            for (k, (light, flux)) in lights.zip(&pass.flux).enumerate() {
-                light
-                    .iter_mut()
-                    .zip(workspace.values().of(k))
-                    .for_each(|(e, seen)| *e = flux * seen);
-            }
+        self.pass.run(&self.state.beam, pull, control, |pass, row_index, row, workspace, found| {
             pass.measure(row_index, workspace);
-            pass.see_slopes(&views, row_index, workspace);
-            let (weights, values, sums) = workspace.parts();
+            let (light, weights, values, sums) = workspace.parts();
             let (fluxes, singular) = (&pass.flux[..], SINGULAR);
             let (prior, few) = (of_row(row_index), pass.few.in_row(row_index));
-            let eliminate =
-                Eliminate { row, fluxes, weights, values, sums, singular, prior, mean, few };
-            found.objective += pulp::Arch::new().dispatch(eliminate);
+            found.objective += pulp::Arch::new().dispatch(Eliminate {
+                row,
+                fluxes,
+                light,
+                weights,
+                values,
+                sums,
+                singular,
+                prior,
+                mean,
+                few,
+            });
         })
     }
 
@@ -336,14 +337,15 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         });
         self.scale = scale;
         if let Some(penalty) = &mut self.penalty {
-            penalty.turn_to(&self.state.beam, &self.weights, self.pass.workers);
+            penalty.turn_to(&self.state.beam, self.pass.workers);
             control.check()?;
         }
         let mut slope = self.pass.workers.filled(self.pull.len(), 0.0, control);
         slope.copy_from_slice(&self.pull);
         let mut objective = self.misfit + self.of_prior + self.pull_by_priors(&mut slope);
         if let Some(penalty) = &self.penalty {
-            objective += penalty.pull(&mut slope[..self.state.beam.len()], self.pass.workers);
+            let slope = &mut slope[..self.state.beam.len()];
+            objective += penalty.pull(&self.scale, slope, self.pass.workers);
         }
         self.balance(&mut slope[..self.state.beam.len()]);
         control.check()?;
@@ -429,24 +431,22 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     /// What a step pulls at the cells once M and O have followed it.
     fn propagate(
         &mut self,
-        beam: &[f64],
         x: &[f64],
         moves: &[[f64; 2]],
         pull: &mut [f64],
         share: f64,
         control: &Control,
     ) -> Result<Sums> {
-        let cells = beam.len();
+        let cells = self.state.beam.len();
         let shares = self.shares(&x[cells..]);
-        let (views, beams) = (self.pass.views_of(&x[..cells]), self.pass.views_of(beam));
-        self.pass.run(pull, control, |pass, row_index, row, workspace, found| {
+        let views = self.pass.views_of(&x[..cells]);
+        self.pass.run(&self.state.beam, pull, control, |pass, row_index, row, workspace, found| {
             pass.weigh_row(row_index, workspace);
-            pass.see_slopes(&beams, row_index, workspace);
-            workspace.begin(row.light, &shares, moves);
+            workspace.begin(&shares, moves);
             pass.see(&views, row_index, workspace);
-            let (weights, values, sums) = workspace.parts();
+            let (light, weights, values, sums) = workspace.parts();
             let fluxes = &pass.flux[..];
-            let propagate = Propagate { row, fluxes, weights, values, sums, share };
+            let propagate = Propagate { row, fluxes, light, weights, values, sums, share };
             found.largest = found.largest.max(pulp::Arch::new().dispatch(propagate));
         })
     }
@@ -465,19 +465,22 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         let cells = self.state.beam.len();
         let shares = self.shares(&x[cells..]);
         let moves = self.centred(&x[cells + self.fluxes.columns.len()..]);
-        let beam = std::mem::take(&mut self.state.beam);
-        let (views, beams) = (self.pass.views_of(&x[..cells]), self.pass.views_of(&beam));
-        let mut pull = vec![0.0; cells];
-        let done = self.pass.run(&mut pull, control, |pass, row_index, mut row, workspace, _| {
+        let views = self.pass.views_of(&x[..cells]);
+        let (beam, mut pull) = (&self.state.beam, vec![0.0; cells]);
+        self.pass.run(beam, &mut pull, control, |pass, row_index, mut row, workspace, _| {
             pass.weigh_row(row_index, workspace);
-            pass.see_slopes(&beams, row_index, workspace);
-            workspace.begin(row.light, &shares, &moves);
+            workspace.begin(&shares, &moves);
             pass.see(&views, row_index, workspace);
-            let (weights, values, sums) = workspace.parts();
-            let fluxes = &pass.flux[..];
-            let propagate =
-                Propagate { row: row.again(), fluxes, weights, values, sums, share: 0.0 };
-            pulp::Arch::new().dispatch(propagate);
+            let (light, weights, values, sums) = workspace.parts();
+            pulp::Arch::new().dispatch(Propagate {
+                row: row.again(),
+                fluxes: &pass.flux,
+                light,
+                weights,
+                values,
+                sums,
+                share: 0.0,
+            });
             row.change.fill(0.0);
             for (k, flux) in pass.flux.iter().enumerate() {
                 let pulls = values.of(k).iter().zip(&*row.sensitivity);
@@ -487,10 +490,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
                 }
             }
             pass.few.clear(row_index, row.change);
-        });
-        drop((views, beams));
-        self.state.beam = beam;
-        done?;
+        })?;
         let mut common = Vec::new();
         self.pass.for_rows(|[_, _, sums, ..]| common.extend_from_slice(sums));
         Ok(common)
@@ -504,21 +504,27 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
 
     /// D, Σ w c² M² over the pixels that see a cell, by their factors, and the penalty that goes with it.
     fn weigh(&mut self, control: &Control) -> Result<()> {
-        let mut weights = self.pass.workers.filled(self.state.beam.len(), 0.0, control);
-        self.pass.run(&mut weights, control, |pass, row_index, row, workspace, _| {
-            let cols = pass.exposures.sensor().cols;
-            pass.weigh_row(row_index, workspace);
-            let (weights, values, _) = workspace.parts();
-            for (k, (weights, flux)) in weights.chunks_exact(cols).zip(&pass.flux).enumerate() {
-                let pixels = weights.iter().zip(&*row.sensitivity);
-                let lights = row.light[k * cols..].iter().zip(&*row.inverse);
-                let values = values.of_mut(k).iter_mut().zip(lights);
-                for ((value, (light, inverse)), (weight, m)) in values.zip(pixels) {
-                    let pulling = share_pulling(weight * light * light * inverse);
-                    *value = pulling * weight * (flux * m) * (flux * m);
+        let mut weights = std::mem::take(&mut self.weights);
+        weights.resize(self.state.beam.len(), 0.0);
+        self.pass.run(
+            &self.state.beam,
+            &mut weights,
+            control,
+            |pass, row_index, row, workspace, _| {
+                let cols = pass.exposures.sensor().cols;
+                pass.weigh_row(row_index, workspace);
+                let (lights, weights, values, _) = workspace.parts();
+                for (k, (weights, flux)) in weights.chunks_exact(cols).zip(&pass.flux).enumerate() {
+                    let pixels = weights.iter().zip(&*row.sensitivity);
+                    let lights = lights[k * cols..].iter().zip(&*row.inverse);
+                    let values = values.of_mut(k).iter_mut().zip(lights);
+                    for ((value, (light, inverse)), (weight, m)) in values.zip(pixels) {
+                        let pulling = share_pulling(weight * light * light * inverse);
+                        *value = pulling * weight * (flux * m) * (flux * m);
+                    }
                 }
-            }
-        })?;
+            },
+        )?;
         self.weights = weights;
         self.is_weighed_anew = self.penalty.is_none();
         if self.pass.grid.is_spline() {
@@ -547,10 +553,11 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         if self.pass.exposures.uniform_weight(exposure).is_none() {
             let _ = self.pass.exposures.stretch(exposure, row, cols.clone(), &mut weights);
         }
-        let (sensor, count) = (self.pass.exposures.sensor(), self.pass.exposures.count());
-        let part = |index: usize| &self.pass.row(row)[index * sensor.cols..][cols.clone()];
-        let pixels = part(count).iter().zip(part(exposure)).zip(part(count + 1));
-        for (weight, ((m, light), inverse)) in weights.iter_mut().zip(pixels) {
+        let width = self.pass.exposures.sensor().cols;
+        let part = |index: usize| &self.pass.row(row)[index * width..][cols.clone()];
+        let pixels = cols.clone().zip(part(0)).zip(part(1));
+        for (weight, ((col, m), inverse)) in weights.iter_mut().zip(pixels) {
+            let light = self.pass.light_at(&self.state.beam, exposure, [row, col]);
             let pulling = share_pulling(*weight * light * light * inverse);
             *weight *= pulling * (self.pass.flux[exposure] * m).powi(2);
         }

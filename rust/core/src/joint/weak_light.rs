@@ -87,10 +87,12 @@ impl<T: Real> System<'_, '_, T> {
         let Shape { rows, cols } = self.pass.exposures.sensor();
         let count = self.pass.exposures.count();
         let (mut squares, mut scratch) = (Vec::new(), vec![0.0; cols]);
+        let (beams, mut workspace) = (self.pass.views_of(&self.state.beam), self.pass.workspace());
         for row in (0..rows).step_by(rows.div_ceil(SAMPLED)) {
             let known = self.pass.row(row);
             let part = |index: usize| known.get(index * cols..(index + 1) * cols);
-            let (sensitivity, offset) = (part(count), part(count + 3));
+            let (sensitivity, offset) = (part(0), part(3));
+            self.pass.see_beam(&beams, row, &mut workspace);
             for k in 0..count {
                 let measured = self.pass.exposures.stretch(k, row, 0..cols, &mut scratch);
                 for col in (0..cols).step_by(cols.div_ceil(SAMPLED)) {
@@ -99,10 +101,10 @@ impl<T: Real> System<'_, '_, T> {
                         Stretch::Weighted(values, weights) => (values[col], weights[col]),
                     };
                     let at = |part: Option<&[f64]>| part.map_or(0.0, |part| part[col]);
-                    let light = at(part(k));
+                    let light = workspace.light[k * cols + col];
                     let left = value.to_f64() - light * at(sensitivity) - at(offset);
                     let is_used = weight > 0.0 && self.pass.few.uses(k, row, col);
-                    if is_used && at(part(count + 1)) > 0.0 {
+                    if is_used && at(part(1)) > 0.0 {
                         squares.push(weight * left * left);
                     }
                 }

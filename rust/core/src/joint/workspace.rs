@@ -7,6 +7,8 @@ use crate::parallel::Add;
 /// The arrays of one thread for a row of pixels.
 pub(crate) struct Workspace {
     pub(crate) weights: Vec<f64>,
+    /// c L of the row.
+    pub(crate) light: Vec<f64>,
     /// Values of the row, then its pulls; before them the pulls of the rows before.
     pub(crate) lines: [Lines; TAPS],
     pub(crate) line: Vec<f64>,
@@ -22,11 +24,11 @@ impl Workspace {
     }
 
     /// Begins a row with what changes of ln c, divided by c, and of d make of the light.
-    pub(crate) fn begin(&mut self, light: &[f64], shares: &[f64], moves: &[[f64; 2]]) {
-        let cols = light.len() / shares.len();
+    pub(crate) fn begin(&mut self, shares: &[f64], moves: &[[f64; 2]]) {
+        let cols = self.light.len() / shares.len();
         let values = &mut self.lines[TAPS - 1];
         values.clear();
-        for (k, (light, share)) in light.chunks_exact(cols).zip(shares).enumerate() {
+        for (k, (light, share)) in self.light.chunks_exact(cols).zip(shares).enumerate() {
             let values = values.of_mut(k);
             if *share != 0.0 {
                 Add { factor: *share, values: light, sums: &mut *values }.dispatch();
@@ -37,9 +39,9 @@ impl Workspace {
         }
     }
 
-    /// What the kernels need beside the row: the weights, the values, and arrays for sums.
-    pub(crate) fn parts(&mut self) -> (&[f64], &mut Lines, &mut [Vec<f64>; 4]) {
-        (&self.weights, &mut self.lines[TAPS - 1], &mut self.sums)
+    /// What the kernels need beside the row: the light, the weights, the values, and arrays for sums.
+    pub(crate) fn parts(&mut self) -> (&[f64], &[f64], &mut Lines, &mut [Vec<f64>; 4]) {
+        (&self.light, &self.weights, &mut self.lines[TAPS - 1], &mut self.sums)
     }
 }
 

@@ -185,6 +185,9 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         preconditioner: &Preconditioner,
         control: &Control,
     ) -> Result<Option<Ended>> {
+        self.system.settle();
+        // It stays from here on.
+        self.taken = None;
         let kept = self.system.seeks_shifts().then(|| slope.clone());
         let mut search = ConjugateGradients::<N>::after(self.known.clone());
         search.begin(&self.system, preconditioner, slope, control)?;
@@ -234,6 +237,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             let freedom = joint::freedom(&self.system) + self.weak.freed;
             self.system.unit = self.system.misfit / freedom;
         }
+        drop(linear);
         self.system.renew(control)
     }
 
@@ -284,9 +288,10 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
                 break;
             }
         }
-        self.known = search.known;
         let [unit, _] = self.system.units::<N>();
-        let mut step: Vec<f64> = search.x.into_iter().map(|x| unit * x.into()).collect();
+        let (x, known) = search.found();
+        self.known = known;
+        let mut step: Vec<f64> = x.into_iter().map(|x| unit * x.into()).collect();
         // A multiple of the beam is no step, but the penalty would see one.
         let cells = self.system.state.beam.len();
         self.system.take_scale_out(&mut step[..cells]);
@@ -340,7 +345,9 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
     }
 
     /// What was found, and what the fluxes leave to the gauge.
-    fn finish(self, ended: Ended, control: &Control) -> Result<Found> {
+    fn finish(mut self, ended: Ended, control: &Control) -> Result<Found> {
+        (self.taken, self.course, self.preconditioner) = (None, None, None);
+        self.system.free_products();
         let system = &self.system;
         let exposures = system.pass.exposures;
         let without_offset = system.without_offset();

@@ -36,7 +36,8 @@ use crate::exposures::Exposures;
 use crate::fit::{Refinement, Solution};
 use crate::frames::{Real, flag};
 use crate::joint::{
-    self, ConjugateGradients, Fluxes, Grid, Preconditioner, ShiftPrior, State, System,
+    self, ConjugateGradients, Fluxes, Grid, Known, Precision, Preconditioner, ShiftPrior, State,
+    System,
 };
 use crate::memory;
 use crate::parallel::Workers;
@@ -47,6 +48,8 @@ mod tests;
 
 /// Upper limit on iterations for one right-hand side.
 const MOST_ITERATIONS: u64 = 500;
+/// The least share of x · b that searches in single precision may lack, where x is off by its root.
+const LEAST_IN_SINGLE: f64 = 1e-8;
 
 /// A linear functional of what was found.
 enum Functional {
@@ -63,7 +66,11 @@ enum Functional {
 pub(super) struct JointCovariance<'m, 'a, T> {
     system: System<'m, 'a, T>,
     preconditioner: Preconditioner,
-    search: ConjugateGradients<f64>,
+    /// What searches of one question have told.
+    known: Known,
+    /// S⁻¹ b of the last right-hand side b, and b · S⁻¹ b.
+    x: Vec<f64>,
+    energy: f64,
     tilts: Tilts,
     /// The shifts that are uncertain though they were not refined.
     considered: Option<ShiftPrior>,
@@ -112,7 +119,9 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             tilts: Tilts::of(&system, solution, &valid),
             system,
             preconditioner,
-            search: ConjugateGradients::default(),
+            known: Known::default(),
+            x: Vec::new(),
+            energy: 0.0,
             considered,
             determined,
             valid,
@@ -142,18 +151,18 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         if left <= NEGLIGIBLE * pixels {
             return Ok(left);
         }
-        self.search = ConjugateGradients::default();
+        self.known = Known::default();
         let propagated = mean_misfit(pixels, |draw| {
             let slope = self.pulls_of_noise(draw, false, control)?;
             self.apply_inverse(slope, LACK_OF_FUNCTIONAL, control)?;
-            Ok(self.search.energy)
+            Ok(self.energy)
         })?;
         Ok(left - propagated)
     }
 
     /// The standard deviation of M by pixel, in units of that of a value of weight 1.
     pub(super) fn error_map(&mut self, control: &Control) -> Result<ErrorMap> {
-        self.search = ConjugateGradients::default();
+        self.known = Known::default();
         let sensor = self.system.pass.exposures.sensor();
         let sampled = if is_smoothed(sensor) {
             smoothed(self, sensor, control)?
@@ -195,7 +204,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         if !self.system.pass.with_offset {
             return Ok(None);
         }
-        self.search = ConjugateGradients::default();
+        self.known = Known::default();
         let along = self.variance_of(Functional::Offset, LACK_OF_FUNCTIONAL, control)?;
         Ok(Some([along, self.mean_variance_of_offset_alone()]))
     }
@@ -205,7 +214,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         functionals: impl ExactSizeIterator<Item = Functional>,
         control: &Control,
     ) -> Result<Vec<f64>> {
-        self.search = ConjugateGradients::default();
+        self.known = Known::default();
         let total = functionals.len() as u64;
         let lack = if self.dark.is_some() { LACK_WITH_DARK } else { LACK_OF_FUNCTIONAL };
         let found = (0..).zip(functionals).map(|(index, functional)| {
@@ -254,8 +263,14 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             pulled.for_each(|(slope, pulled)| *slope -= pulled);
         }
         self.apply_inverse(slope, lack, control)?;
-        let x = std::mem::take(&mut self.search.x);
-        product(&mut self.system, &x, control)?;
+        let x = std::mem::take(&mut self.x);
+        if self.system.has_single() {
+            let [unit, _] = self.system.units::<f32>();
+            let short: Vec<f32> = x.iter().map(|x| (x / unit) as f32).collect();
+            product(&mut self.system, &short, control)?;
+        } else {
+            product(&mut self.system, &x, control)?;
+        }
         add_change(&self.system, &mut change);
         let workers = self.system.pass.workers;
         if let Some(drift) = &self.tilts.drift {
@@ -269,7 +284,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
     /// once S x = its pull is solved.
     fn variance_by_dark(&mut self, gain: &[f64], control: &Control) -> Result<f64> {
         let Some(dark) = &self.dark else { return Ok(0.0) };
-        let influence = self.system.propagate_common(&self.search.x, control)?;
+        let influence = self.system.propagate_common(&self.x, control)?;
         Ok(dark.variance_of(gain, &influence))
     }
 
@@ -314,7 +329,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         self.apply_inverse(pull, lack, control)?;
         variance += self.found_variance() + self.variance_by_dark(&gain, control)?;
         if self.considered.is_some() {
-            let mut x = std::mem::take(&mut self.search.x);
+            let mut x = std::mem::take(&mut self.x);
             x.truncate(others);
             x.resize(others + seen.len(), 0.0);
             let pulled = self.considering(|system| product(system, &x, control))?;
@@ -399,12 +414,38 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
 
     /// xᵀ S x at the x that the search found.
     fn found_variance(&self) -> f64 {
-        self.search.energy + self.system.left_out(&self.search.x)
+        self.energy + self.system.left_out(&self.x)
     }
 
-    /// (S − N)⁻¹ b, left in the search.
+    /// Finds x = (S − N)⁻¹ b and x · b.
     fn apply_inverse(&mut self, b: Vec<f64>, lack: f64, control: &Control) -> Result<()> {
-        let Self { system, preconditioner, search, .. } = self;
+        if self.system.has_single() && lack >= LEAST_IN_SINGLE {
+            self.search::<f32>(b, lack, control)
+        } else {
+            self.search::<f64>(b, lack, control)
+        }
+    }
+
+    /// [`apply_inverse`](Self::apply_inverse) in numbers of this precision.
+    fn search<N: Precision>(&mut self, b: Vec<f64>, lack: f64, control: &Control) -> Result<()> {
+        let mut search = ConjugateGradients::<N>::after(self.known.clone());
+        let done = self.iterate(&mut search, b, lack, control);
+        let units = self.system.units::<N>();
+        self.energy = units[0] * units[1] * search.energy;
+        let (x, known) = search.found();
+        self.x = x.into_iter().map(|x| units[0] * x.into()).collect();
+        self.known = known;
+        done
+    }
+
+    fn iterate<N: Precision>(
+        &mut self,
+        search: &mut ConjugateGradients<N>,
+        b: Vec<f64>,
+        lack: f64,
+        control: &Control,
+    ) -> Result<()> {
+        let Self { system, preconditioner, .. } = self;
         search.begin(system, preconditioner, b, control)?;
         let (first, mut earlier) = (search.square, 0.0);
         for iteration in 1..=MOST_ITERATIONS {

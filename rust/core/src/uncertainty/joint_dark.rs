@@ -40,17 +40,20 @@ impl Dark {
         variance: &[f64],
         control: &Control,
     ) -> Result<Self> {
-        let mut no_pull = vec![0.0; system.state.beam.len()];
-        let found =
-            system.pass.run(&mut no_pull, control, |pass, row_index, row, workspace, found| {
+        let (beam, mut no_pull) = (&system.state.beam, vec![0.0; system.state.beam.len()]);
+        let found = system.pass.run(
+            beam,
+            &mut no_pull,
+            control,
+            |pass, row_index, row, workspace, found| {
                 pass.weigh_row(row_index, workspace);
                 workspace.values().clear();
                 let cols = row.change.len();
                 let variance = &variance[row_index * cols..];
                 for col in 0..cols {
                     let [mut sum, mut along] = [0.0; 2];
-                    let exposures =
-                        workspace.weights.chunks_exact(cols).zip(row.light.chunks_exact(cols));
+                    let lights = workspace.light.chunks_exact(cols);
+                    let exposures = workspace.weights.chunks_exact(cols).zip(lights);
                     for (weights, light) in exposures.filter(|_| row.inverse[col] > 0.0) {
                         sum += weights[col];
                         along += weights[col] * light[col];
@@ -61,7 +64,8 @@ impl Dark {
                 let left = &mut workspace.sums[0][..cols];
                 pass.few.clear(row_index, left);
                 found.objective += left.iter().sum::<f64>();
-            })?;
+            },
+        )?;
         let mut propagation = vec![0.0; variance.len()];
         add_change(system, &mut propagation);
         let std = variance.iter().map(|v| v.sqrt()).collect();

@@ -3,7 +3,7 @@
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
-use crate::joint::{Pass, Row, System, Workspace};
+use crate::joint::{Pass, Precision, Row, System, Workspace};
 
 /// Cᵀ of a functional: what changes of the other unknowns do to it through M and O, which follow a
 /// change u = c M v of the light by −α = −(i₁₁ eᵀw u + i₁₂ 1ᵀw u) and −β = −(i₁₂ eᵀw u + i₂₂ 1ᵀw u).
@@ -18,9 +18,9 @@ pub(super) fn pull_of<T: Real>(
         let cols = pass.exposures.sensor().cols;
         let (gain, offset) = (&gain[row_index * cols..], &offset[row_index * cols..]);
         let [_, i12, i22] = row.offset;
-        let (weights, values, _) = workspace.parts();
+        let (light, weights, values, _) = workspace.parts();
         for (k, (weights, flux)) in weights.chunks_exact(cols).zip(&pass.flux).enumerate() {
-            let light = &row.light[k * cols..];
+            let light = &light[k * cols..];
             for (col, value) in values.of_mut(k).iter_mut().enumerate() {
                 let (mut along_light, mut alone) = (row.inverse[col] * gain[col], 0.0);
                 if !i22.is_empty() {
@@ -43,26 +43,22 @@ pub(super) fn pull_by<T: Real>(
     control: &Control,
     work: impl Fn(&Pass<'_, '_, T>, usize, Row<'_>, &mut Workspace) + Sync,
 ) -> Result<Vec<f64>> {
-    let beam = std::mem::take(&mut system.state.beam);
-    let views = system.pass.views_of(&beam);
-    let mut pull = vec![0.0; beam.len()];
-    let found = system.pass.run(&mut pull, control, |pass, row_index, row, workspace, _| {
-        pass.weigh_row(row_index, workspace);
-        pass.see_slopes(&views, row_index, workspace);
-        work(pass, row_index, row, workspace);
-    });
-    drop(views);
-    system.state.beam = beam;
-    system.append(&found?, &mut pull);
+    let (beam, mut pull) = (&system.state.beam, vec![0.0; system.state.beam.len()]);
+    let found =
+        system.pass.run(beam, &mut pull, control, |pass, row_index, row, workspace, _| {
+            pass.weigh_row(row_index, workspace);
+            work(pass, row_index, row, workspace);
+        })?;
+    system.append(&found, &mut pull);
     Ok(pull)
 }
 
 /// S x.
-pub(super) fn product<T: Real>(
+pub(super) fn product<N: Precision, T: Real>(
     system: &mut System<'_, '_, T>,
-    x: &[f64],
+    x: &[N],
     control: &Control,
-) -> Result<Vec<f64>> {
+) -> Result<Vec<N>> {
     let mut product = Vec::new();
     system.multiply(x, &mut product, 0.0, control)?;
     Ok(product)
@@ -82,18 +78,17 @@ pub(super) fn variance_by_cells<T: Real>(
     system: &mut System<'_, '_, T>,
     control: &Control,
 ) -> Result<Vec<f64>> {
-    let of_cells = std::mem::take(&mut system.weights);
-    let views = system.pass.views_of(&of_cells);
-    let mut no_pull = vec![0.0; of_cells.len()];
-    let done = system.pass.run(&mut no_pull, control, |pass, row_index, row, workspace, _| {
+    let views = system.pass.views_of(&system.weights);
+    let (beam, mut no_pull) = (&system.state.beam, vec![0.0; system.weights.len()]);
+    system.pass.run(beam, &mut no_pull, control, |pass, row_index, row, workspace, _| {
         pass.weigh_row(row_index, workspace);
         workspace.values().clear();
         pass.see(&views, row_index, workspace);
         let cols = row.change.len();
-        let (weights, values, _) = workspace.parts();
+        let (light, weights, values, _) = workspace.parts();
         row.change.fill(0.0);
         for (k, flux) in pass.flux.iter().enumerate() {
-            let (weights, light) = (&weights[k * cols..][..cols], &row.light[k * cols..][..cols]);
+            let (weights, light) = (&weights[k * cols..][..cols], &light[k * cols..][..cols]);
             for (col, weight) in values.of_mut(k).iter_mut().enumerate() {
                 let share =
                     row.inverse[col] * weights[col] * light[col] * flux * row.sensitivity[col];
@@ -101,10 +96,7 @@ pub(super) fn variance_by_cells<T: Real>(
                 *weight = 0.0;
             }
         }
-    });
-    drop(views);
-    system.weights = of_cells;
-    done?;
+    })?;
     let mut variance = vec![0.0; system.pass.exposures.sensor().len()];
     add_change(system, &mut variance);
     Ok(variance)

@@ -47,7 +47,8 @@ impl<T: Real> JointCovariance<'_, '_, T> {
         let cells = system.state.beam.len();
         if let Some(penalty) = &system.penalty {
             let beam = &system.state.beam;
-            penalty.add_draw(beam, &mut of_penalty, &mut slope[..cells], system.pass.workers);
+            let (scale, slope) = (&system.scale, &mut slope[..cells]);
+            penalty.add_draw(beam, scale, &mut of_penalty, slope, system.pass.workers);
         }
         let params = system.fluxes.columns.len();
         let mut pulls = system.precisions();
@@ -89,7 +90,7 @@ impl<T: Real> JointCovariance<'_, '_, T> {
             let cols = pass.exposures.sensor().cols;
             let errors = dark.iter().flat_map(|dark| dark.errors(draw, row_index, sensor));
             let errors: Vec<f64> = errors.collect();
-            let (weights, values, sums) = workspace.parts();
+            let (light, weights, values, sums) = workspace.parts();
             for (k, (weights, flux)) in weights.chunks_exact(cols).zip(&pass.flux).enumerate() {
                 let mut sign = random::signs(streams[k] + row_index as u64);
                 let pixels = weights.iter().zip(&*row.sensitivity);
@@ -105,7 +106,7 @@ impl<T: Real> JointCovariance<'_, '_, T> {
                 }
             }
             let fluxes = &pass.flux[..];
-            let propagate = Propagate { row, fluxes, weights, values, sums, share: 0.0 };
+            let propagate = Propagate { row, fluxes, light, weights, values, sums, share: 0.0 };
             pulp::Arch::new().dispatch(propagate);
         })
     }

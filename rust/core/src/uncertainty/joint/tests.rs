@@ -6,6 +6,7 @@ use crate::frames::Stack;
 use crate::geometry::Rotation;
 use crate::parallel::dot;
 use crate::testing::{SENSOR, SHIFTS, assert_unit_and_independent, random_number, random_vector};
+use crate::uncertainty::sampling::LACK_OF_DRAW;
 
 const ROTATIONS: [Rotation; 5] =
     [Rotation::None, Rotation::None, Rotation::Half, Rotation::Quarter, Rotation::None];
@@ -160,17 +161,24 @@ fn the_change_of_a_draw_is_the_transpose_of_the_pull_of_a_functional() {
             } else {
                 product(&mut covariance.system, &whole, control).unwrap()
             };
-            let change = covariance.change(b[..size].to_vec(), &wrong, LACK, control).unwrap();
-            let energy = covariance.search.energy;
             let mut in_gauge = gain.clone();
             covariance.tilts.gauge.transpose(&mut in_gauge, covariance.system.pass.workers);
             let (pull, seen) = covariance.pull_of_gain(&in_gauge, control).unwrap();
             let wanted = dot(&pull, &x) + dot(&seen, &wrong);
             let variance = covariance.variance_of_gain(gain.clone(), 1e-4, control).unwrap();
-            // By Cauchy and Schwarz in the norm of S, where the solution is off by √LACK of itself.
-            let allowed = (LACK * energy * variance).sqrt();
-            let off = (dot(&gain, &change) - wanted).abs();
-            assert!(off <= allowed, "{off:e} of {wanted:e}, above {allowed:e}");
+            // The second is for searches in single precision, where they serve.
+            for lack in [LACK, LACK_OF_DRAW] {
+                let change = covariance.change(b[..size].to_vec(), &wrong, lack, control).unwrap();
+                // By Cauchy and Schwarz in the norm of S, where the solution is off by √lack of itself.
+                let allowed = (lack * covariance.energy * variance).sqrt();
+                let off = (dot(&gain, &change) - wanted).abs();
+                assert!(off <= allowed, "{off:e} of {wanted:e}, above {allowed:e}");
+                covariance.apply_inverse(b[..size].to_vec(), lack, control).unwrap();
+                // Two sums of some hundred products, in single precision.
+                let rounding = 100.0 * f64::from(f32::EPSILON);
+                let found = dot(&covariance.x, &b[..size]);
+                assert!((covariance.energy / found - 1.0).abs() < rounding);
+            }
         });
     }
 }
