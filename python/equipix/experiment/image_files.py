@@ -22,7 +22,7 @@ from equipix.experiment.manifest import (
 from equipix.io import binary, camera_raw
 from equipix.io.arrays import split
 from equipix.io.formats import FrameFile, refuse_saved
-from equipix.io.frames import frame_format, read_frames
+from equipix.io.frames import frame_format, read_frames, stream_frames
 from equipix.io.paths import reading
 from equipix.measured.colour import Colours
 from equipix.measured.statistics import saved_shape
@@ -269,6 +269,29 @@ def raw_frames(files: Iterable[Path]) -> Array:
 def sha256_of(files: Iterable[Path]) -> dict[Path, str]:
     """Hashes of the content of files."""
     return {file: _sha256(file) for file in files}
+
+
+def marks_of_levels(hashes: Mapping[Path, str]) -> dict[Path, str]:
+    """Hashes of files by which levels of light must differ; the name of one that may be equal.
+
+    Images in saturation are equal, and without light those of a camera that shows 0: half of their
+    values or more are the smallest or the largest.
+    """
+    counts = Counter(hashes.values())
+    repeated = {file: each for file, each in hashes.items() if counts[each] > 1}
+    uniform: dict[str, bool] = {}
+    for file, each in repeated.items():
+        if each not in uniform:
+            uniform[each] = saved_shape(file) is None and _is_uniform(file)
+    return {
+        file: str(file.resolve()) if uniform.get(each) else each for file, each in hashes.items()
+    }
+
+
+def _is_uniform(file: Path) -> bool:
+    """Whether half of the values of the first frame are its smallest, or its largest."""
+    _, frames = next(stream_frames(file))
+    return bool(np.median(frames[0]) in (frames[0].min(), frames[0].max()))
 
 
 def with_inputs(metadata: dict[str, Any], hashes: Mapping[Path, str]) -> dict[str, Any]:
