@@ -291,7 +291,8 @@ class CameraExperiment(Described[CameraManifest]):
         entries = [*entries_of(self.path, self.manifest)]
         for entry in entries:
             try:
-                shape = check_formats([entries[0].files[0], *entry.files])
+                files = [entries[0].files[0], *entry.files]
+                shape = check_formats(files, self.manifest.sensor.bit_depth)
             except FileError as error:
                 raise FileError(f"{self.path}, {entry}: {error}") from error
         refuse_other_types(self.path, self.manifest)

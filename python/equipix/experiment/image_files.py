@@ -28,13 +28,14 @@ from equipix.measured.colour import Colours
 from equipix.measured.statistics import saved_shape
 
 
-def check_formats(files: Sequence[Path]) -> tuple[int, int]:
+def check_formats(files: Sequence[Path], bit_depth: int | None = None) -> tuple[int, int]:
     """Return the shape (rows, cols) that all files have.
 
     Raises
     ------
     FileError
-        If a file cannot be read, or differs in shape from most, or in depth from the first of them.
+        If a file cannot be read, or differs in shape from most, or in depth from the first of them;
+        or if whole numbers of its type have fewer bits than the sensor.
     """
     formats = {file: _format(file) for file in files}
     wanted = Counter(shape for shape, _ in formats.values()).most_common(1)[0][0]
@@ -47,7 +48,20 @@ def check_formats(files: Sequence[Path]) -> tuple[int, int]:
                 f"{file}: holds {dtype or 'averaged'} frames of shape {shape}, expected "
                 f"{wanted_dtype or 'averaged'} of shape {wanted} as in {first}"
             )
+        bits = _bits(dtype)
+        if bits is not None and bit_depth is not None and bit_depth > bits:
+            raise FileError(
+                f"{file}: holds values of {bits} bits ({dtype}), but 'bit_depth' in [sensor] is "
+                f"{bit_depth}: write {bits}, or the bits of these files if they have fewer"
+            )
     return wanted
+
+
+def _bits(dtype: np.dtype[Any] | None) -> int | None:
+    """Bits of the largest value of a type of whole numbers; None of others."""
+    return (
+        None if dtype is None or dtype.kind not in "iu" else int(np.iinfo(dtype).max).bit_length()
+    )
 
 
 def _format(file: Path) -> tuple[tuple[int, int], np.dtype[Any] | None]:
