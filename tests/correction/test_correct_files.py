@@ -112,6 +112,15 @@ class TestNotFinite:
         write_frames(Path("good.tif"), [values], nbytes=values.nbytes)
         assert correct_files(response, ["good.tif"], Path("out.tif")).findings == ()
 
+    def test_frames_without_a_number_are_one_finding(self, response, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        lost = np.full(SHAPE, np.nan, np.float32)
+        write_frames(Path("lost.tif"), [lost], nbytes=lost.nbytes)
+        with pytest.warns(InputWarning) as caught:
+            done = correct_files(response, ["lost.tif"], Path("out.tif"))
+        assert [each.kind for each in done.findings] == ["not_finite"]
+        assert [each.category for each in caught] == [InputWarning]
+
 
 class TestDarks:
     def test_of_several_each_file_takes_the_one_that_fits(self, response, night):

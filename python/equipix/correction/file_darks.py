@@ -14,6 +14,7 @@ from equipix.findings import Finding, Findings, say
 from equipix.io.formats import FrameFile, frame_files
 from equipix.io.frames import Header, Settings
 from equipix.measured.average import average
+from equipix.measured.part import median
 from equipix.measured.settings import (
     TOLERANCE_K,
     Shares,
@@ -212,9 +213,9 @@ def is_as_dark(frame: Array, dark: Array) -> bool:
     """Whether the median of a frame is above that of its dark by less than half of the noise."""
     step = -(-frame.size // _SAMPLED)
     above = frame.ravel()[::step] - dark.ravel()[::step]
-    level = np.nanmedian(above)
+    level = median(above)
     # A normal distribution has half of its values within 0.6745 standard deviations.
-    return bool(level <= 0.5 * np.nanmedian(abs(above - level)) / 0.6745)
+    return bool(level <= 0.5 * median(abs(above - level)) / 0.6745)
 
 
 def _warn_of_settings(
@@ -229,7 +230,7 @@ def _warn_of_settings(
 
 def warn_of_darker(frame: Array, dark: Array) -> Findings:
     """Warn of a frame from which the dark was probably subtracted before."""
-    level, below = np.nanmedian(dark), np.nanmedian(dark - frame)
+    level, below = median(dark), median(dark - frame)
     if level > 0 and below > DARKER * level:
         words = (
             f"the first frame is darker than the dark by {below:.4g} of {level:.4g} DN in the "
