@@ -542,6 +542,14 @@ def test_files_that_cannot_be_read_say_what_to_do(run, experiment, calibration, 
         result = run(command, path, *(() if command == "inspect" else ("-o", output)))
         refused(result, f"{path}: ", words)
         assert not re.search("codec|zip|Errno|byte 0x|expected str", result[2])
+    cut = tmp_path / "cut.tif"
+    for size in (9999, frames.stat().st_size - 1000):
+        cut.write_bytes(frames.read_bytes()[:size])
+        for result in (
+            run("correct", calibration, cut, "-o", tmp_path / "corrected.tif"),
+            run("average", cut, "-o", output),
+        ):
+            refused(result, f"{cut}: is truncated: copy it again, or record it again")
     for command, name, content, words in (
         ("average", "text.dng", b"hello", "is no .dng file of a camera that LibRaw reads"),
         ("average", "text.fits", b"hello", "no .fits file: use a copy, or make it again (it holds"),

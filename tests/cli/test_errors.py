@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import equipix
-from equipix import cli
+from equipix import cli, simulate
 
 
 @pytest.fixture
@@ -171,6 +171,17 @@ class TestVerbose:
             equipix.nuc.fit([average.mean, average.mean * 2.0], order=1)
         assert "averaged 3 frames" in caplog.text
         assert "fits 2 levels of 20 × 30 pixels by order 1" in caplog.text
+
+    @pytest.mark.parametrize("uncertainty", [False, True])
+    def test_standard_deviations_are_named_when_they_begin(self, uncertainty, caplog):
+        sensitivity = simulate.cosine_sensitivity((48, 48), rng=1)
+        beam = simulate.gaussian_beam((48, 48), width=60)
+        shifts = equipix.cross_pattern(5, 7)
+        frames = simulate.exposures(sensitivity, beam, shifts)
+        with caplog.at_level(logging.INFO, "equipix"):
+            equipix.calibrate(frames, shifts, variance=np.full(5, 1e-6), uncertainty=uncertainty)
+        said = [each.message.partition(" ")[0] for each in caplog.records]
+        assert said == ["fitted:", *(["computes"] if uncertainty else [])]
 
     def test_nothing_is_printed_unless_asked_for(self, frames, capfd):
         equipix.average(frames)

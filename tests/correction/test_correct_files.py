@@ -112,6 +112,15 @@ class TestNotFinite:
         write_frames(Path("good.tif"), [values], nbytes=values.nbytes)
         assert correct_files(response, ["good.tif"], Path("out.tif")).findings == ()
 
+    def test_frames_without_a_number_are_one_finding(self, response, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        lost = np.full(SHAPE, np.nan, np.float32)
+        write_frames(Path("lost.tif"), [lost], nbytes=lost.nbytes)
+        with pytest.warns(InputWarning) as caught:
+            done = correct_files(response, ["lost.tif"], Path("out.tif"))
+        assert [each.kind for each in done.findings] == ["not_finite"]
+        assert [each.category for each in caught] == [InputWarning]
+
 
 class TestDarks:
     def test_of_several_each_file_takes_the_one_that_fits(self, response, night):
@@ -228,6 +237,27 @@ class TestDarks:
         (found,) = done.findings
         assert found.kind == "dark_frames"
         assert found.message.startswith(f"dark5-1.{suffix} and 1 more: given as frames, but")
+
+    def test_dark_frames_beside_the_stored_dark_are_a_finding(self, response, night):
+        for name in ("dark5-0", "m31-5"):
+            write_frames(f"{name}.tif", read_frames(f"{name}.fits"), nbytes=1)
+        source = ["dark5-0.tif", "m31-5.tif"]
+        with pytest.warns(InputWarning, match="as dark as the dark of the correction"):
+            done = correct_files(response, source, night / "o")
+        assert [(each.kind, each.message) for each in done.findings] == [
+            (
+                "dark_frames",
+                "dark5-0.tif: given as frames, but as dark as the dark of the correction. If they "
+                "hold no light, leave them out",
+            )
+        ]
+        # Frames from which the dark was subtracted are another finding.
+        lit = (read_frames("m31-5.tif") - response.dark - LIGHT).astype(np.float32)
+        for name in ("a.tif", "b.tif"):
+            write_frames(name, lit, nbytes=lit.nbytes)
+        with pytest.warns(InputWarning, match="darker than the dark"):
+            done = correct_files(response, ["a.tif", "b.tif"], night / "below")
+        assert [each.kind for each in done.findings] == ["bright_dark"]
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import tracemalloc
 
 import numpy as np
@@ -627,6 +628,31 @@ def test_one_dark_may_serve_several_levels(camera):
     # Equal darks at all times determine no dark current.
     with pytest.warns(errors.InputWarning, match=" do not determine dark current by the mean"):
         assert figures(path).transfer.gain_dn_per_e == pytest.approx(0.25, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("file", "copied", "at"),
+    [
+        ("b9.tif", "d3.tif", "'dark' of exposure '4' and in 'frames' of exposure '10'"),
+        ("b9.tif", "b2.tif", "'frames' of exposure '3' and in 'frames' of exposure '10'"),
+        ("b9.tif", "b.tif", r"'frames' of exposure '10' and in 'frames' of table 'spatial'"),
+    ],
+)
+def test_copies_of_files_are_refused(camera, tmp_path, file, copied, at):
+    shutil.copytree(camera.parent, tmp_path, dirs_exist_ok=True)
+    shutil.copy(tmp_path / copied, tmp_path / file)
+    with pytest.raises(errors.FileError, match=rf"are the same images, and stand in {at}: give"):
+        CameraExperiment.load(tmp_path / camera.name).figures()
+
+
+def test_images_of_saturated_levels_may_be_equal(camera, tmp_path):
+    """All pixels of a camera of few bits are at the largest value, but for a dead one."""
+    shutil.copytree(camera.parent, tmp_path, dirs_exist_ok=True)
+    frames = np.full_like(read_frames(camera.parent / "b12.tif"), 4095)
+    frames[:, 3, 4] = 0
+    for file in ("b12.tif", "b13.tif"):
+        write_frames(tmp_path / file, frames, nbytes=frames.nbytes)
+    assert figures(tmp_path / camera.name).transfer.gain_dn_per_e == pytest.approx(0.25, rel=0.1)
 
 
 def test_averages_stand_for_their_frames(camera):

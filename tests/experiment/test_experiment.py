@@ -9,7 +9,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from equipix import Experiment, Flag, FrameStatistics, errors, load, metrics, simulate
+from equipix import (
+    CameraExperiment,
+    Experiment,
+    Flag,
+    FrameStatistics,
+    LevelExperiment,
+    errors,
+    load,
+    metrics,
+    simulate,
+)
 from equipix.experiment import experiment as experiment_run
 from equipix.fitting.weighted import weighted_fit
 from equipix.io.frames import read_frames
@@ -393,6 +403,41 @@ def test_values_that_the_bits_do_not_hold_are_refused(edited):
     path = edited("bit_depth = 12", "bit_depth = 10")
     with pytest.raises(errors.FileError, match=r"above 1023, .* correct 'bit_depth'"):
         Experiment.load(path).run()
+
+
+@pytest.mark.parametrize(
+    ("load", "evaluate", "content"),
+    [
+        (
+            Experiment.load,
+            Experiment.run,
+            '[dark]\nframes = "0.tif"\n'
+            '[[exposure]]\nname = "a"\nframes = "1.tif"\n'
+            '[[exposure]]\nname = "b"\nshift = [0, 1]\nframes = "2.tif"\n',
+        ),
+        (
+            LevelExperiment.load,
+            LevelExperiment.run,
+            '[[level]]\nframes = "0.tif"\n[[level]]\nframes = "1.tif"\n',
+        ),
+        (
+            CameraExperiment.load,
+            CameraExperiment.figures,
+            '[[exposure]]\nframes = "0.tif"\ndark = "1.tif"\nexposure_s = 1.0\nphotons = 1.0\n'
+            '[[exposure]]\nframes = "2.tif"\ndark = "1.tif"\nexposure_s = 1.0\nphotons = 2.0\n',
+        ),
+    ],
+    ids=["experiment", "levels", "camera"],
+)
+def test_more_bits_than_the_files_hold_are_refused(tmp_path, load, evaluate, content):
+    """In files of 8 bits no value reaches 4095 DN, so saturation would not be found."""
+    path = tmp_path / "bits.toml"
+    for k in range(3):
+        write_tiff(tmp_path / f"{k}.tif", np.full((2, *SHAPE), 50 + k, np.uint8))
+    path.write_text(f"[sensor]\nbit_depth = 12\n{content}")
+    words = r"0.tif: holds values of 8 bits \(uint8\), but 'bit_depth' .* is 12: write 8, or"
+    with pytest.raises(errors.FileError, match=words):
+        evaluate(load(path))
 
 
 @pytest.mark.parametrize(

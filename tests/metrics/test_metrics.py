@@ -435,6 +435,16 @@ class TestEmvaTransfer:
         ):
             metrics.emva_transfer(bright, dark, change(light))
 
+    @pytest.mark.parametrize("last", [False, True])
+    def test_dark_frames_in_place_of_a_bright_level_are_refused(self, last):
+        bright, dark, light = self.levels(np.random.default_rng(11))
+        at = len(bright) - 1 if last else len(bright) // 2
+        bright = [*bright[:at], dark[at], *bright[at + 1 :]]
+        with pytest.raises(
+            errors.InputError, match=rf"at level {at}, .* and frames with light at level {at}"
+        ):
+            metrics.emva_transfer(bright, dark, light)
+
     def test_the_high_pass_takes_a_part_of_a_white_pattern(self):
         """What docs/camera.md states: the root of the sum of the squares of the filter."""
         point = np.zeros((41, 41))

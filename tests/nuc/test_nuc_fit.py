@@ -440,6 +440,20 @@ class TestBadPixels:
         response = nuc.fit(levels, order=1)
         assert response.flags[3, 4] == Flag.HOT | Flag.DO_NOT_USE
 
+    @pytest.mark.parametrize("variance", [NOISE.of_mean(400), None])
+    def test_a_pixel_is_judged_by_the_levels_at_which_it_does_not_saturate(self, levels, variance):
+        levels = noisy(levels, np.random.default_rng(16), NOISE.of_mean(400))
+        levels[:, 3, 4] *= 2.6
+        levels[:, 8, 9] = np.minimum(1.3 * levels[:, 8, 9], 4095)
+        levels[1:, 20, 30] = 4095
+        levels[:, 3, 4] = np.minimum(levels[:, 3, 4], 4095)
+        assert levels[7, 3, 4] == levels[7, 8, 9] == 4095
+        response = nuc.fit(levels, order=1, saturation=4095, variance=variance)
+        assert response.flags[3, 4] == Flag.HOT | Flag.DO_NOT_USE | Flag.SATURATED
+        assert response.flags[8, 9] == Flag.SATURATED
+        # One level shows no rise.
+        assert not response.flags[20, 30] & Flag.HOT
+
     def test_a_value_that_is_missing_costs_one_level_of_its_pixel(self, levels):
         levels[7, 3, 4] = np.nan
         levels[1:, 8, 9] = np.nan

@@ -126,8 +126,8 @@ def calibrate(
     uncertainty : bool
         Whether to compute `Calibration.sensitivity_std`, `Calibration.tilt_std` and, for refined
         shifts, `Calibration.shift_std`: the effect of noise and of the priors on fluxes and
-        shifts. It takes about ten times as long as the calibration, after a joint fit about a
-        hundred times. Without `variance` the noise is that of the residuals.
+        shifts. It takes several times as long as the calibration, with refined shifts
+        tens of times. Without `variance` the noise is that of the residuals.
     workers : int, optional
         Number of threads; by default as many as processors may be used. It changes no bit of the
         result.
@@ -254,6 +254,8 @@ def calibrated(
     LOG.info("fitted: %d passes over the data, estimated error %.2g", sweeps[-1], errors[-1])
     # Before the error bars, which may be refused or interrupted.
     said += say(*ask(AFTER, evidence, said))
+    if options.uncertainty:
+        LOG.info("computes standard deviations, which may take most of the time")
     evidence = evidence.with_error_bars()
     said += say(*ask(LAST, evidence))
     return Calibration.of(evidence, said, _metadata(evidence, started) | (provenance or {}))

@@ -217,7 +217,9 @@ class _Correcting:
         if dark is not None:
             if self._file is None:
                 self.findings = warn_of_darker(frame, dark)
-            if file in self._darks.suspects and is_as_dark(frame, dark):
+            # Frames from which the dark was subtracted are below it, whatever light they hold.
+            is_raw = not self.findings
+            if is_raw and file in self._darks.suspects and is_as_dark(frame, dark):
                 self.as_dark.append(file)
         self._file = file
 

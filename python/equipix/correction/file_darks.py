@@ -14,6 +14,7 @@ from equipix.findings import Finding, Findings, say
 from equipix.io.formats import FrameFile, frame_files
 from equipix.io.frames import Header, Settings
 from equipix.measured.average import average
+from equipix.measured.part import median
 from equipix.measured.settings import (
     TOLERANCE_K,
     Shares,
@@ -135,6 +136,7 @@ def _worded(
         also = "twice: give it once" if name in others else "and names files too: leave out one"
         raise InputError(f"'dark' (--dark) is '{name}' {also}")
     said = _warn_of_dark_frames(headers)
+    suspects: frozenset[Path] = frozenset()
     if name == "none":
         refuse_dark(correction, name)
     elif correction.needs_dark:
@@ -146,7 +148,8 @@ def _worded(
         known = settings_in(correction.metadata.get("dark_settings", {}))
         place = "the dark of the correction"
         said += _warn_of_settings(place, known, headers, _tolerance(correction))
-    return FileDarks(names, {}, dict.fromkeys(headers, (1.0,)), findings=said)
+        suspects = _untyped(headers)
+    return FileDarks(names, {}, dict.fromkeys(headers, (1.0,)), suspects, said)
 
 
 def _tolerance(correction: Correction) -> float:
@@ -170,7 +173,12 @@ def _suspects(
     The shell leaves one file of such a pattern to the option, and gives the others as frames.
     """
     is_bare = [Path(name) for name in names] == [dark[0].path] and dark[0].kind is None
-    if not is_bare or len(headers) < 2:
+    return _untyped(headers) if is_bare else frozenset()
+
+
+def _untyped(headers: Mapping[Path, Header]) -> frozenset[Path]:
+    """Files of frames, among others, whose headers do not name the type of image."""
+    if len(headers) < 2:
         return frozenset()
     return frozenset(file for file, each in headers.items() if not each.image_type.value)
 
@@ -202,8 +210,11 @@ def warn_of_as_dark(files: Sequence[Path], dark: str) -> Findings:
     """Warn of frames that are as dark as the dark, so that they are probably dark frames."""
     if not files:
         return ()
+    named, todo = (dark, _QUOTE)
+    if dark in _WORDED:
+        named, todo = "the dark of the correction", "leave them out"
     words = (
-        f"{_some(files)}: given as frames, but as dark as {dark}. If they hold no light, {_QUOTE}"
+        f"{_some(files)}: given as frames, but as dark as {named}. If they hold no light, {todo}"
     )
     return say(Finding("dark_frames", words, "input"))
 
@@ -212,9 +223,9 @@ def is_as_dark(frame: Array, dark: Array) -> bool:
     """Whether the median of a frame is above that of its dark by less than half of the noise."""
     step = -(-frame.size // _SAMPLED)
     above = frame.ravel()[::step] - dark.ravel()[::step]
-    level = np.nanmedian(above)
+    level = median(above)
     # A normal distribution has half of its values within 0.6745 standard deviations.
-    return bool(level <= 0.5 * np.nanmedian(abs(above - level)) / 0.6745)
+    return bool(level <= 0.5 * median(abs(above - level)) / 0.6745)
 
 
 def _warn_of_settings(
@@ -229,7 +240,7 @@ def _warn_of_settings(
 
 def warn_of_darker(frame: Array, dark: Array) -> Findings:
     """Warn of a frame from which the dark was probably subtracted before."""
-    level, below = np.nanmedian(dark), np.nanmedian(dark - frame)
+    level, below = median(dark), median(dark - frame)
     if level > 0 and below > DARKER * level:
         words = (
             f"the first frame is darker than the dark by {below:.4g} of {level:.4g} DN in the "

@@ -13,7 +13,14 @@ from equipix._check import Floats, Progress, ReadOnly, naming_memory
 from equipix.detector.photons import EV_UM
 from equipix.errors import FileError, InputError
 from equipix.experiment.described import Described
-from equipix.experiment.image_files import check_formats, entries_of, refuse_other_types, sha256_of
+from equipix.experiment.image_files import (
+    check_formats,
+    entries_of,
+    marks_of_levels,
+    refuse_other_types,
+    refuse_repeats,
+    sha256_of,
+)
 from equipix.experiment.manifest import (
     CameraExposure,
     CameraLight,
@@ -205,8 +212,8 @@ class CameraExperiment(Described[CameraManifest]):
         Raises
         ------
         FileError
-            If a file cannot be read, images differ in size or depth, or the levels do not determine
-            the figures.
+            If a file cannot be read, images differ in size or depth, two files have the same
+            content, or the levels do not determine the figures.
         InsufficientMemoryError
             If the memory that it takes cannot be had.
 
@@ -226,7 +233,9 @@ class CameraExperiment(Described[CameraManifest]):
         shape = self._shape()
         colours = Colours.of(self.manifest.sensor.cfa)
         places = {"": _ALL} if colours is None else places_of(colours)
-        origin = self._provenance(sha256_of([self.path, *self.files()]), None)
+        hashes = sha256_of([self.path, *self.files()])
+        refuse_repeats(self.path, self.manifest, marks_of_levels(hashes))
+        origin = self._provenance(hashes, None)
         with naming_memory("averaging"):
             found = {
                 plane: self._evaluated(plane, partial(self._mean, place, shape, workers), progress)
@@ -282,7 +291,8 @@ class CameraExperiment(Described[CameraManifest]):
         entries = [*entries_of(self.path, self.manifest)]
         for entry in entries:
             try:
-                shape = check_formats([entries[0].files[0], *entry.files])
+                files = [entries[0].files[0], *entry.files]
+                shape = check_formats(files, self.manifest.sensor.bit_depth)
             except FileError as error:
                 raise FileError(f"{self.path}, {entry}: {error}") from error
         refuse_other_types(self.path, self.manifest)

@@ -197,11 +197,12 @@ class Described(Brief, Generic[_Manifest]):
         Raises
         ------
         FileError
-            If images differ in shape or depth, two are the same, or a header names another type of
-            image; if the mask file is of another shape, a region reaches beyond the sensor, or
-            nothing is left.
+            If images differ in shape or depth, or have fewer bits than the sensor; if two are the
+            same, or a header names another type of image; if the mask file is of another shape, a
+            region reaches beyond the sensor, or nothing is left.
         """
-        shape: tuple[int, int] = check_formats(image_files(self.path, self.manifest))
+        files, bits = image_files(self.path, self.manifest), self.manifest.sensor.bit_depth
+        shape: tuple[int, int] = check_formats(files, bits)
         refuse_other_types(self.path, self.manifest)
         count = len(self.manifest.measurements)
         given = None if mask is None else as_mask(mask, (count, *shape))

@@ -22,19 +22,20 @@ from equipix.experiment.manifest import (
 from equipix.io import binary, camera_raw
 from equipix.io.arrays import split
 from equipix.io.formats import FrameFile, refuse_saved
-from equipix.io.frames import frame_format, read_frames
+from equipix.io.frames import frame_format, read_frames, stream_frames
 from equipix.io.paths import reading
 from equipix.measured.colour import Colours
 from equipix.measured.statistics import saved_shape
 
 
-def check_formats(files: Sequence[Path]) -> tuple[int, int]:
+def check_formats(files: Sequence[Path], bit_depth: int | None = None) -> tuple[int, int]:
     """Return the shape (rows, cols) that all files have.
 
     Raises
     ------
     FileError
-        If a file cannot be read, or differs in shape from most, or in depth from the first of them.
+        If a file cannot be read, or differs in shape from most, or in depth from the first of them;
+        or if whole numbers of its type have fewer bits than the sensor.
     """
     formats = {file: _format(file) for file in files}
     wanted = Counter(shape for shape, _ in formats.values()).most_common(1)[0][0]
@@ -47,7 +48,20 @@ def check_formats(files: Sequence[Path]) -> tuple[int, int]:
                 f"{file}: holds {dtype or 'averaged'} frames of shape {shape}, expected "
                 f"{wanted_dtype or 'averaged'} of shape {wanted} as in {first}"
             )
+        bits = _bits(dtype)
+        if bits is not None and bit_depth is not None and bit_depth > bits:
+            raise FileError(
+                f"{file}: holds values of {bits} bits ({dtype}), but 'bit_depth' in [sensor] is "
+                f"{bit_depth}: write {bits}, or the bits of these files if they have fewer"
+            )
     return wanted
+
+
+def _bits(dtype: np.dtype[Any] | None) -> int | None:
+    """Bits of the largest value of a type of whole numbers; None of others."""
+    return (
+        None if dtype is None or dtype.kind not in "iu" else int(np.iinfo(dtype).max).bit_length()
+    )
 
 
 def _format(file: Path) -> tuple[tuple[int, int], np.dtype[Any] | None]:
@@ -269,6 +283,29 @@ def raw_frames(files: Iterable[Path]) -> Array:
 def sha256_of(files: Iterable[Path]) -> dict[Path, str]:
     """Hashes of the content of files."""
     return {file: _sha256(file) for file in files}
+
+
+def marks_of_levels(hashes: Mapping[Path, str]) -> dict[Path, str]:
+    """Hashes of files by which levels of light must differ; the name of one that may be equal.
+
+    Images in saturation are equal, and without light those of a camera that shows 0: half of their
+    values or more are the smallest or the largest.
+    """
+    counts = Counter(hashes.values())
+    repeated = {file: each for file, each in hashes.items() if counts[each] > 1}
+    uniform: dict[str, bool] = {}
+    for file, each in repeated.items():
+        if each not in uniform:
+            uniform[each] = saved_shape(file) is None and _is_uniform(file)
+    return {
+        file: str(file.resolve()) if uniform.get(each) else each for file, each in hashes.items()
+    }
+
+
+def _is_uniform(file: Path) -> bool:
+    """Whether half of the values of the first frame are its smallest, or its largest."""
+    _, frames = next(stream_frames(file))
+    return bool(np.median(frames[0]) in (frames[0].min(), frames[0].max()))
 
 
 def with_inputs(metadata: dict[str, Any], hashes: Mapping[Path, str]) -> dict[str, Any]:

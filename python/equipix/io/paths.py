@@ -142,7 +142,14 @@ def reading(path: Path) -> Iterator[None]:
     finally:
         logger.removeHandler(complaints)
     if complaints.messages:
-        raise FileError(f"{path}: is broken: {complaints.messages[0]}")
+        words = complaints.messages[0].rpartition("> ")[2]
+        cut = words.startswith(_BEYOND)
+        broken = f"is broken: {words}: use a copy, or make it again"
+        raise FileError(f"{path}: {'is truncated' if cut else broken}")
+
+
+_BEYOND = "invalid page offset", "invalid offset to page"
+"""What tifffile logs of a page that begins, or whose directory ends, beyond the end of the file."""
 
 
 def _is_text(path: Path) -> bool:

@@ -472,13 +472,16 @@ def transfer_of(
         )
     if not levels[below].any():
         raise InputError(f"{light} is 0 at all levels up to 70 % of saturation, expected light")
-    if (falls := _falling(levels, signal, linear)) is not None:
+    if (falls := _falling(levels, signal, linear, below)) is not None:
         at = [names[k] if names else f"level {k}" for k in falls]
         (weak, strong), (high, low) = levels[falls], signal[falls]
+        is_dark = low < _LINEAR[0] * saturation
         raise InputError(
             f"{light} is {weak:g} at {at[0]} and {strong:g} at {at[1]}, where the signal is "
             f"{high:.6g} and {low:.6g} DN: expected light that rises with the signal, one value "
-            "for each level" + ("" if names else " in the order of 'frames'")
+            "for each level"
+            + ("" if names else " in the order of 'frames'")
+            + (f", and frames with light at {at[1]}" if is_dark else "")
         )
     gain = _slope(signal[below], variance[below])
     responsivity = _slope(levels[below], signal[below])
@@ -566,14 +569,19 @@ def _refuse_dark(dark: Floats, bright: Floats) -> None:
         )
 
 
-def _falling(light: Floats, signal: Floats, linear: Bools) -> list[int] | None:
-    """Two levels of which the second has more light and less signal, if there are any."""
-    order = np.flatnonzero(linear)[np.lexsort((signal[linear], light[linear]))]
-    highest = np.maximum.accumulate(signal[order])
-    falls = np.flatnonzero(signal[order] < (1 - _LOWER) * highest)
+def _falling(light: Floats, signal: Floats, linear: Bools, below: Bools) -> list[int] | None:
+    """Two levels of which the second has more light and less signal, if there are any.
+
+    The first counts for the linearity, the second for that or for the slopes: frames without light
+    in place of a bright level do.
+    """
+    counts = linear | below
+    order = np.flatnonzero(counts)[np.lexsort((signal[counts], light[counts]))]
+    compared = np.where(linear[order], signal[order], -np.inf)
+    falls = np.flatnonzero(signal[order] < (1 - _LOWER) * np.maximum.accumulate(compared))
     if not falls.size:
         return None
-    return [int(order[np.argmax(signal[order[: falls[0]]])]), int(order[falls[0]])]
+    return [int(order[np.argmax(compared[: falls[0]])]), int(order[falls[0]])]
 
 
 def _slope(x: Floats, y: Floats) -> float:

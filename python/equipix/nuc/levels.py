@@ -291,25 +291,53 @@ def _with_odd_responses(
     bad_pixels: BadPixels,
     filters: Filters | None,
 ) -> BadPixels:
-    """Add pixels that rise by less than half, or more than twice, as much as their neighbours."""
+    """Add pixels that rise by less than half, or more than twice, as much as their neighbours.
+
+    From the lowest to the highest level at which a pixel has a value.
+    """
     if len(values) < 2 or not all(np.isfinite(each).any() for each in values):
         return bad_pixels
-    means = [median(each) for each in values]
-    low, high = int(np.argmin(means)), int(np.argmax(means))
-    rise = means[high] - means[low]
-    variance = sum(float(noise[each].variance(means[each])) for each in (low, high)) if noise else 0
+    means = np.array([median(each) for each in values])
+    order = np.argsort(means)
+    rise, std = _rise(values, means, noise, order[0], order[-1])
     # A rise within the noise is refused later, with the number of levels that differ.
-    if rise <= SIGMAS * np.sqrt(variance) or (not noise and rise <= _scatter(values, low, high)):
+    if not rise:
         return bad_pixels
     # Of a colour of less response the noise is that of the array, which is the larger one.
-    usual = rise if filters is None else rise * filters.map_of(values.shape[1:])
-    response = values[high] - values[low]
-    response /= usual
-    std = np.broadcast_to(np.sqrt(variance) / usual, response.shape)
-    dead, hot = response_outliers(response, lambda: std)
+    colours = 1.0 if filters is None else filters.map_of(values.shape[1:])
+    response = (values[order[-1]] - values[order[0]]) / (rise * colours)
+    stds = np.broadcast_to(std / (rise * colours), response.shape)
+    missing = np.isnan(response)
+    if missing.any():
+        # As at a level where a pixel saturates: it is judged by those where it does not.
+        stds = stds.copy()
+        known = np.isfinite(values[:, missing][order])
+        pairs = np.stack([known.argmax(axis=0), len(order) - 1 - known[::-1].argmax(axis=0)])
+        for first, last in np.unique(pairs, axis=1).T.tolist():
+            low, high = order[first], order[last]
+            rise, std = _rise(values, means, noise, low, high)
+            if first < last and rise:
+                pixels = np.zeros_like(missing)
+                pixels[missing] = (pairs == [[first], [last]]).all(axis=0)
+                usual = rise * np.broadcast_to(colours, response.shape)[pixels]
+                response[pixels] = (values[high][pixels] - values[low][pixels]) / usual
+                stds[pixels] = std / usual
+    dead, hot = response_outliers(response, lambda: stds)
     return dataclasses.replace(
         bad_pixels, dead=union(bad_pixels.dead, dead), hot=union(bad_pixels.hot, hot)
     )
+
+
+def _rise(
+    values: Array, means: Floats, noise: tuple[LevelNoise, ...] | None, low: int, high: int
+) -> tuple[float, float]:
+    """Rise of the means from one level to another and the noise of a pixel's; 0 within noise."""
+    rise = float(means[high] - means[low])
+    variance = sum(float(noise[each].variance(means[each])) for each in (low, high)) if noise else 0
+    std = float(np.sqrt(variance))
+    if rise <= SIGMAS * std or (not noise and rise <= _scatter(values, low, high)):
+        return 0.0, std
+    return rise, std
 
 
 def _scatter(values: Array, low: int, high: int) -> float:
