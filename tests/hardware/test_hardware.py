@@ -1002,7 +1002,11 @@ def test_the_command_writes_a_table(made, tmp_path, run):
         "both": widths.both_bits,
     }
     assert 8 < found["gain"] <= 16
-    assert run(*command, "--force", "--gain-bits", 20)[0] == 1
+    # Beyond the range that the help states; and one file as two levels.
+    assert run(*command, "--force", "--gain-bits", 20)[0] == 2
+    twice = run(*command, "--force", *2 * ("--frames", tmp_path / "level.tif"))
+    assert twice[0] == 1
+    assert "level.tif: is named twice" in twice[2]
     assert "Example" in run("hardware", "--help")[1]
 
 

@@ -717,7 +717,9 @@ class TestCorrectedFiles:
         write_frames(folder / "deep.tif", frame, nbytes=1)
         arguments = ("correct", tmp_path / "response.tif", folder / "deep.tif", "-o")
         status, _, err = run(*arguments, tmp_path / "no.tif")
-        assert (status, "holds 40000, above 16383, the largest" in err) == (1, True)
+        assert (status, "deep.tif: 'frames' holds 40000, above 16383" in err) == (1, True)
+        status, _, err = run(*arguments, tmp_path / "no.tif", "--dtype=uint16", "--bit-depth=17")
+        assert (status, "--bit-depth" in err) == (2, True)
         assert not (tmp_path / "no.tif").exists()
 
     def test_a_png_given_again_is_noticed(self, corrected, run, folder, tmp_path):

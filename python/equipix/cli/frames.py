@@ -79,7 +79,7 @@ def averaged(
     "numbers and pictures the mean of good neighbours.",
     dtype="Type of the result: whole numbers are rounded half to even, and values that had to be "
     "limited are counted. float32 unless given; uint16 for a .png.",
-    bit_depth="Significant bits of whole numbers, 8 to 16.",
+    bit_depth=typer.Option(min=8, max=16, help="Significant bits of whole numbers."),
     display="8-bit pictures, in no .fits: 'linear' between the percentiles 0.5 and 99.5 of each "
     "frame, or by its 'histogram' with a plateau of 4 times the mean of its bins.",
 )

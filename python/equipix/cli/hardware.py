@@ -15,6 +15,7 @@ from equipix.hardware.encode import line_of
 from equipix.hardware.quality import Cost, Trial, trial, widths_of
 from equipix.hardware.table import IMAGES, SUFFIXES, UPLOAD, Table
 from equipix.hardware.words import WIDEST
+from equipix.io.paths import refuse_inputs
 from equipix.report.figures import summary
 from equipix.saved_results import READ, load_correction
 
@@ -29,11 +30,11 @@ commands = typer.Typer()
 )
 @terminal.options_of(
     Table.of,
-    adc_bits="Bits of the ADC, 8 to 16; those of the sensor.",
+    adc_bits=typer.Option(min=8, max=16, help="Bits of the ADC; those of the sensor."),
     dac_bits="Bits of the coarse offset, 8 to 16; 0 without a DAC.",
-    offset_bits="Bits of the fine offset, 8 to 16.",
-    gain_bits="Bits of the gain, 8 to 16.",
-    out_bits="Bits of the output, 8 to 16.",
+    offset_bits=typer.Option(min=8, max=16, help="Bits of the fine offset."),
+    gain_bits=typer.Option(min=8, max=16, help="Bits of the gain."),
+    out_bits=typer.Option(min=8, max=16, help="Bits of the output."),
     adc_step="DN in a step of the ADC, a power of two.",
     out_step="DN in a step of the output; by the range of the ADC.",
     dac_step="DN in a step of the DAC; the finest that fits.",
@@ -145,6 +146,7 @@ def _cost(
     file: Path, correction: Correction, frames: list[str], options: dict[str, Any]
 ) -> tuple[dict[str, Any], Findings]:
     """Measure C of frames of each level by correction and table, and the widths that suffice."""
+    refuse_inputs(map(Path, frames), [], "is named twice: name the frames of each level once")
     with naming_memory("measuring quality"), terminal.working() as (progress, _):
         shown = {"progress": progress}
         tried, said = zip(

@@ -205,9 +205,12 @@ class _Correcting:
         if lost := int(np.count_nonzero(~np.isfinite(frames) & self._good)):
             self.not_finite[file] += lost
         native = frames.dtype.newbyteorder("=")
-        return self.corrector.apply(
-            frames.astype(native if native in FAST else np.float32, copy=False)
-        )
+        try:
+            return self.corrector.apply(
+                frames.astype(native if native in FAST else np.float32, copy=False)
+            )
+        except InputError as error:
+            raise type(error)(f"{file}: {error}") from error
 
     def _go_on(self, file: Path, frame: Array) -> None:
         """Take the dark of the next file, whose first frame is compared with it."""
