@@ -186,10 +186,8 @@ impl Fused {
                 values: &mut values,
                 pulls: &mut pulls,
             }));
-            for (k, &col) in (0..count)
-                .flat_map(|k| pass.few.in_row(first + index).iter().map(move |col| (k, col)))
-            {
-                pulls.row_mut(k, index)[AROUND + col] = 0.0;
+            for &col in pass.few.in_row(first + index) {
+                (0..count).for_each(|k| pulls.row_mut(k, index)[AROUND + col] = 0.0);
             }
             self.back(pass, index, &pulls, &mut line, strips);
         }

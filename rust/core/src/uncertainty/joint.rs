@@ -26,8 +26,8 @@
 use super::joint_dark::Dark;
 use super::joint_gauge::{Hidden, Tilts, count, form, valid};
 use super::joint_pulls::{add_change, product, pull_of};
-use super::sampling::{ErrorMap, LACK_OF_FUNCTIONAL, LACK_WITH_DARK, NEGLIGIBLE, NOTHING};
-use super::sampling::{Sampled, mean_misfit};
+use super::sampling::{ErrorMap, LACK_OF_DRAW, LACK_OF_FUNCTIONAL, LACK_WITH_DARK};
+use super::sampling::{NEGLIGIBLE, NOTHING, Sampled, mean_misfit};
 use super::smoothed::{is_smoothed, smoothed};
 use crate::control::Control;
 use crate::convergence::FEWEST_ITERATIONS;
@@ -48,8 +48,6 @@ mod tests;
 
 /// Upper limit on iterations for one right-hand side.
 const MOST_ITERATIONS: u64 = 500;
-/// The least share of x · b that searches in single precision may lack, where x is off by its root.
-const LEAST_IN_SINGLE: f64 = 1e-8;
 
 /// A linear functional of what was found.
 enum Functional {
@@ -419,7 +417,8 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
 
     /// Finds x = (S − N)⁻¹ b and x · b.
     fn apply_inverse(&mut self, b: Vec<f64>, lack: f64, control: &Control) -> Result<()> {
-        if self.system.has_single() && lack >= LEAST_IN_SINGLE {
+        // Rounding leaves a lack of some 1e-7 in single precision.
+        if self.system.has_single() && lack >= LACK_OF_DRAW {
             self.search::<f32>(b, lack, control)
         } else {
             self.search::<f64>(b, lack, control)

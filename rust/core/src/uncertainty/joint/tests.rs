@@ -166,6 +166,7 @@ fn the_change_of_a_draw_is_the_transpose_of_the_pull_of_a_functional() {
             let (pull, seen) = covariance.pull_of_gain(&in_gauge, control).unwrap();
             let wanted = dot(&pull, &x) + dot(&seen, &wrong);
             let variance = covariance.variance_of_gain(gain.clone(), 1e-4, control).unwrap();
+            let mut energies = Vec::new();
             // The second is for searches in single precision, where they serve.
             for lack in [LACK, LACK_OF_DRAW] {
                 let change = covariance.change(b[..size].to_vec(), &wrong, lack, control).unwrap();
@@ -173,12 +174,9 @@ fn the_change_of_a_draw_is_the_transpose_of_the_pull_of_a_functional() {
                 let allowed = (lack * covariance.energy * variance).sqrt();
                 let off = (dot(&gain, &change) - wanted).abs();
                 assert!(off <= allowed, "{off:e} of {wanted:e}, above {allowed:e}");
-                covariance.apply_inverse(b[..size].to_vec(), lack, control).unwrap();
-                // Two sums of some hundred products, in single precision.
-                let rounding = 100.0 * f64::from(f32::EPSILON);
-                let found = dot(&covariance.x, &b[..size]);
-                assert!((covariance.energy / found - 1.0).abs() < rounding);
+                energies.push(covariance.energy);
             }
+            assert!((energies[1] / energies[0] - 1.0).abs() <= LACK_OF_DRAW, "{energies:?}");
         });
     }
 }
