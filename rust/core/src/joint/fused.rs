@@ -13,7 +13,7 @@
 //! rounding (iterative refinement).
 
 use super::bands::Bands;
-use super::fused_kernel::{Along, Back, Eliminate, LANES, Ring, Subtract, Sum};
+use super::fused_kernel::{Along, Back, Block, Eliminate, Ring, Subtract, Sum};
 use super::kernel::{AROUND, Row};
 use super::pass::Pass;
 use super::penalty::Penalty;
@@ -65,7 +65,7 @@ impl Fused {
     ) -> Self {
         let (sensor, count) = (pass.exposures.sensor(), pass.exposures.count());
         let bands = Bands::new(&pass.windows, &pass.grid.geometry.views, pass.grid.width, BAND);
-        let width = sensor.cols.next_multiple_of(LANES);
+        let width = sensor.cols;
         let is_uneven = (0..count).any(|k| pass.exposures.uniform_weight(k).is_none());
         let gain = |k: usize, w: Option<f64>| w.map_or(1.0, |w| (w / weight).sqrt() * pass.flux[k]);
         let along = |k: usize| {
@@ -153,7 +153,7 @@ impl Fused {
         let stride = pass.grid.geometry.beam.cols;
         let mut seen = [&self.beam[..], x].map(|cells| (cells, Ring::new(count, self.width)));
         let mut pulls = Ring::new(count, self.width + 2 * AROUND);
-        let mut values = vec![[[0.0; LANES]; 2]; count];
+        let mut block = Block::new(count);
         let mut line = vec![0.0; self.width + 2 * AROUND];
         let (first, mut largest) = (band * self.bands.height, 0.0_f64);
         let height = rows.len();
@@ -183,7 +183,7 @@ impl Fused {
                 row: Row::of(row, cols),
                 unit: self.weight * self.light * self.light,
                 share,
-                values: &mut values,
+                block: &mut block,
                 pulls: &mut pulls,
             }));
             for &col in pass.few.in_row(first + index) {

@@ -4,7 +4,18 @@ use super::kernel::{AROUND, Row};
 use crate::geometry::TAPS;
 
 /// Values side by side, which vector registers hold.
-pub(super) const LANES: usize = 16;
+const LANES: usize = 16;
+/// Pixels that a row is taken by: what is found of them on the way stays in the nearest cache.
+pub(super) const BLOCK: usize = 256;
+
+/// Σ_i t_i a_i of four rows of values.
+#[inline(always)]
+fn combine([s, t, u, v]: [f32; TAPS], rows: [&[f32]; TAPS], sums: &mut [f32]) {
+    let [a, b, c, d] = rows;
+    for ((((sum, a), b), c), d) in sums.iter_mut().zip(a).zip(b).zip(c).zip(d) {
+        *sum = s * a + t * b + u * c + v * d;
+    }
+}
 
 /// Σ_j u_j a(col + j): what the pixels of a row see of a row of cells along it.
 pub(super) struct Along<'s> {
@@ -18,12 +29,9 @@ impl pulp::NullaryFnOnce for Along<'_> {
 
     #[inline(always)]
     fn call(self) {
-        let [s, t, u, v] = self.taps;
         let cols = self.seen.len();
-        let [a, b, c, d] = [0, 1, 2, 3].map(|from| &self.values[from..from + cols]);
-        for ((((seen, a), b), c), d) in self.seen.iter_mut().zip(a).zip(b).zip(c).zip(d) {
-            *seen = s * a + t * b + u * c + v * d;
-        }
+        let shifted = [0, 1, 2, 3].map(|from| &self.values[from..from + cols]);
+        combine(self.taps, shifted, self.seen);
     }
 }
 
@@ -44,39 +52,33 @@ impl Ring {
         &self.values[(exposure * TAPS + index % TAPS) * self.width..][..self.width]
     }
 
+    /// The rows that the taps lead to, of which the first has number `index`, from one place on.
+    #[inline(always)]
+    fn block(&self, exposure: usize, index: usize, first: usize, cols: usize) -> [&[f32]; TAPS] {
+        let row = |tap: usize| self.row(exposure, index + tap);
+        let (a, b, c, d) = (row(0), row(1), row(2), row(3));
+        let place = first..first + cols;
+        [&a[place.clone()], &b[place.clone()], &c[place.clone()], &d[place]]
+    }
+
     #[inline(always)]
     pub(super) fn row_mut(&mut self, exposure: usize, index: usize) -> &mut [f32] {
         &mut self.values[(exposure * TAPS + index % TAPS) * self.width..][..self.width]
     }
 }
 
-/// The values of a row from one place on. A closure would stay a call within the dispatched code.
-#[inline(always)]
-fn lanes(row: &[f32], start: usize) -> [f32; LANES] {
-    let mut values = [0.0; LANES];
-    values.copy_from_slice(&row[start..start + LANES]);
-    values
+/// Buffers for a block of pixels.
+pub(super) struct Block {
+    /// l and v of each exposure.
+    seen: Vec<[[f32; BLOCK]; 2]>,
+    /// α, M and M².
+    pixels: [[f32; BLOCK]; 3],
 }
 
-/// What pixels of a row see of a ring of rows of cells, of which the first tap takes number `index`.
-#[inline(always)]
-fn across(
-    ring: &Ring,
-    exposure: usize,
-    index: usize,
-    taps: [f32; TAPS],
-    start: usize,
-) -> [f32; LANES] {
-    let [s, t, u, v] = taps;
-    let a = lanes(ring.row(exposure, index), start);
-    let b = lanes(ring.row(exposure, index + 1), start);
-    let c = lanes(ring.row(exposure, index + 2), start);
-    let d = lanes(ring.row(exposure, index + 3), start);
-    let mut seen = [0.0; LANES];
-    for i in 0..LANES {
-        seen[i] = s * a[i] + t * b[i] + u * c[i] + v * d[i];
+impl Block {
+    pub(super) fn new(exposures: usize) -> Self {
+        Self { seen: vec![[[0.0; BLOCK]; 2]; exposures], pixels: [[0.0; BLOCK]; 3] }
     }
-    seen
 }
 
 /// What pixels see of the beam and of a change of it, l and v, and what they pull back once M has followed by
@@ -96,8 +98,7 @@ pub(super) struct Eliminate<'s> {
     /// i times Σ w e².
     pub(super) unit: f64,
     pub(super) share: f64,
-    /// Buffers for l and v of each exposure.
-    pub(super) values: &'s mut [[[f32; LANES]; 2]],
+    pub(super) block: &'s mut Block,
     /// The pulls of the row, of the same number.
     pub(super) pulls: &'s mut Ring,
 }
@@ -107,57 +108,73 @@ impl pulp::NullaryFnOnce for Eliminate<'_> {
 
     #[inline(always)]
     fn call(self) -> f64 {
-        let Self { seen, index, taps, gains, row, unit, share, values, pulls } = self;
+        let Self { seen, index, taps, gains, row, unit, share, block, pulls } = self;
         let width = seen[0].width;
-        let mut largest = [0.0_f64; LANES];
-        let pixels = row.change.chunks_mut(LANES).zip(row.sensitivity.chunks(LANES));
-        for (chunk, ((last, m), inverse)) in pixels.zip(row.inverse.chunks(LANES)).enumerate() {
-            let start = chunk * LANES;
-            let mut along = [0.0; LANES];
-            for (k, ([level, value], &taps)) in values.iter_mut().zip(taps).enumerate() {
-                *level = across(seen[0], k, index, taps, start);
-                *value = across(seen[1], k, index, taps, start);
+        let Block { seen: found, pixels: [along, m, square] } = block;
+        let mut largest = 0.0_f64;
+        let rows = row.change.chunks_mut(BLOCK).zip(row.sensitivity.chunks(BLOCK));
+        for (number, ((last, sensitivity), inverse)) in
+            rows.zip(row.inverse.chunks(BLOCK)).enumerate()
+        {
+            let (first, cols) = (number * BLOCK, last.len());
+            let (along, m, square) = (&mut along[..cols], &mut m[..cols], &mut square[..cols]);
+            along.fill(0.0);
+            for (k, ([level, value], &taps)) in found.iter_mut().zip(taps).enumerate() {
+                let (level, value) = (&mut level[..cols], &mut value[..cols]);
+                combine(taps, seen[0].block(k, index, first, cols), level);
+                combine(taps, seen[1].block(k, index, first, cols), value);
                 if let Some(gains) = gains {
-                    let gain = lanes(gains, k * width + start);
-                    for i in 0..LANES {
-                        level[i] *= gain[i];
-                        value[i] *= gain[i];
-                    }
+                    let gains = &gains[k * width + first..][..cols];
+                    level.iter_mut().zip(gains).for_each(|(level, gain)| *level *= gain);
+                    value.iter_mut().zip(gains).for_each(|(value, gain)| *value *= gain);
                 }
-                for i in 0..LANES {
-                    along[i] += level[i] * value[i];
-                }
+                let both = level.iter().zip(&*value);
+                along.iter_mut().zip(both).for_each(|(sum, (level, value))| *sum += level * value);
             }
-            // Behind the last pixel M is 0.
-            let [mut sensitivity, mut square] = [[0.0; LANES]; 2];
-            for (i, (m, inverse)) in m.iter().zip(inverse).enumerate() {
-                along[i] *= (unit * inverse) as f32;
-                sensitivity[i] = *m as f32;
-                square[i] = sensitivity[i] * sensitivity[i];
+            let pixels = along.iter_mut().zip(&mut *m).zip(&mut *square);
+            for (((along, m), square), (of_row, inverse)) in
+                pixels.zip(sensitivity.iter().zip(inverse))
+            {
+                *along *= (unit * inverse) as f32;
+                *m = *of_row as f32;
+                *square = *m * *m;
             }
-            for (k, [level, value]) in values.iter().enumerate() {
-                let mut pull = [0.0; LANES];
-                for i in 0..LANES {
-                    pull[i] = square[i] * (value[i] - level[i] * along[i]);
+            for (k, [level, value]) in found.iter().enumerate() {
+                let pull = &mut pulls.row_mut(k, index)[AROUND + first..][..cols];
+                let pixels = square.iter().zip(&*along);
+                for ((pull, (square, along)), (level, value)) in
+                    pull.iter_mut().zip(pixels).zip(level.iter().zip(value))
+                {
+                    *pull = square * (value - level * along);
                 }
                 if let Some(gains) = gains {
-                    let gain = lanes(gains, k * width + start);
-                    for i in 0..LANES {
-                        pull[i] *= gain[i];
-                    }
+                    let gains = &gains[k * width + first..][..cols];
+                    pull.iter_mut().zip(gains).for_each(|(pull, gain)| *pull *= gain);
                 }
-                pulls.row_mut(k, index)[AROUND + start..][..LANES].copy_from_slice(&pull);
             }
-            for (i, (last, largest)) in last.iter_mut().zip(&mut largest).enumerate() {
-                let change = f64::from(sensitivity[i] * along[i]);
-                // A maximum would lose what is no number, a minimum does not.
-                let size = (change + share * *last).abs().min(f64::INFINITY);
-                *largest = largest.max(size);
-                *last = -change;
-            }
+            largest = largest.max(follow(last, [m, along], share));
         }
-        largest.into_iter().fold(0.0, f64::max)
+        largest
     }
+}
+
+/// Takes the changes −M α of pixels in place of the last; returns the largest size less a share of those before.
+#[inline(always)]
+fn follow(last: &mut [f64], [m, along]: [&[f32]; 2], share: f64) -> f64 {
+    let mut largest = [0.0_f64; LANES];
+    let pixels = m.chunks(LANES).zip(along.chunks(LANES));
+    for (last, (m, along)) in last.chunks_mut(LANES).zip(pixels) {
+        for ((last, largest), (m, along)) in
+            last.iter_mut().zip(&mut largest).zip(m.iter().zip(along))
+        {
+            let change = f64::from(m * along);
+            // A maximum would lose what is no number, a minimum does not.
+            let size = (change + share * *last).abs().min(f64::INFINITY);
+            *largest = largest.max(size);
+            *last = -change;
+        }
+    }
+    largest.into_iter().fold(0.0, f64::max)
 }
 
 /// Adds to a row of cells what the pulls of four rows of pixels make of it.
@@ -178,11 +195,7 @@ impl pulp::NullaryFnOnce for Back<'_> {
     fn call(self) {
         let cols = self.sums.len();
         let line = &mut self.line[..cols + AROUND];
-        let [s, t, u, v] = self.along_rows;
-        let [a, b, c, d] = self.rows.map(|row| &row[..cols + AROUND]);
-        for ((((line, a), b), c), d) in line.iter_mut().zip(a).zip(b).zip(c).zip(d) {
-            *line = s * a + t * b + u * c + v * d;
-        }
+        combine(self.along_rows, self.rows.map(|row| &row[..cols + AROUND]), line);
         let [s, t, u, v] = self.along_cols;
         let [a, b, c, d] = [0, 1, 2, 3].map(|from| &line[from..from + cols]);
         for ((((sum, a), b), c), d) in self.sums.iter_mut().zip(a).zip(b).zip(c).zip(d) {
