@@ -46,8 +46,6 @@ pub(crate) struct Preconditioner {
     /// 1/D of θ and shifts; 0 for what no measurement determines.
     params: Vec<f64>,
     coarse: Coarse,
-    /// Cells of a row.
-    cols: usize,
     /// Whether the beam is a spline.
     filters: bool,
 }
@@ -119,8 +117,7 @@ impl Preconditioner {
         }
         let params = whole.into_iter().map(invert).collect();
         let (wide, filters) = (Wide::new(hats, system, control), system.pass.grid.is_spline());
-        let cols = system.pass.grid.geometry.beam.cols;
-        Ok(Self { wide, waves, inverse, rim, params, coarse, cols, filters })
+        Ok(Self { wide, waves, inverse, rim, params, coarse, filters })
     }
 
     /// Whether the coarse matrix has a factor.
@@ -159,7 +156,10 @@ impl Preconditioner {
             }
             let first = band * BAND;
             if self.filters {
-                self.filter(of_cells, first, [inward, outward], part);
+                let (inverse, scales) = (&self.inverse[..], [inward, outward]);
+                let z = &mut *part;
+                let filtered = Filtered { r: of_cells, inverse, cols, first, scales, z };
+                pulp::Arch::new().dispatch(filtered);
             } else {
                 let own = of_cells[first * cols..].iter().zip(&self.inverse[first * cols..]);
                 for (z, (&r, &inverse)) in part.iter_mut().zip(own) {
@@ -199,41 +199,55 @@ impl Preconditioner {
         self.waves.spread(&self.wide, &lines, 0, outward, &mut found);
         found
     }
+}
 
-    /// χ K D⁻¹ K χ r on rows of cells from `first` on.
-    fn filter<N: Value>(&self, r: &[N], first: usize, scales: [f64; 2], z: &mut [N]) {
-        let (cols, around) = (self.cols, FILTER.len() / 2);
-        let [mut before, mut between] = [(); 2].map(|()| FilterRows::new(cols));
+/// χ K D⁻¹ K χ r on rows of cells from `first` on, times `inward` and `outward`.
+struct Filtered<'s, N> {
+    r: &'s [N],
+    inverse: &'s [f32],
+    cols: usize,
+    first: usize,
+    scales: [f64; 2],
+    z: &'s mut [N],
+}
+
+impl<N: Value> pulp::NullaryFnOnce for Filtered<'_, N> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        let Self { r, inverse, cols, first, scales, z } = self;
+        let around = FILTER.len() / 2;
+        let [mut before, mut between] = [FilterRows::new(cols), FilterRows::new(cols)];
         let [inward, outward] = scales.map(N::of);
         let mut found = vec![0.0; cols];
         // Rows that come in, counted from as many above as both filters reach.
         for step in 0..z.len() / cols + 4 * around {
-            let inside = |row: Option<usize>| row.filter(|&row| row < r.len() / cols);
-            let of = |row: usize| row * cols..(row + 1) * cols;
+            let row = (first + step).wrapping_sub(2 * around);
             let line = before.next();
-            match inside((first + step).checked_sub(2 * around)).map(of) {
-                Some(row) => {
-                    let input = r[row.clone()].iter().zip(&self.inverse[row]);
-                    for (line, (&r, d)) in line.iter_mut().zip(input) {
-                        *line = if *d > 0.0 { Into::<f64>::into(inward * r) as f32 } else { 0.0 };
-                    }
+            if row < r.len() / cols {
+                let cells = row * cols..(row + 1) * cols;
+                let input = r[cells.clone()].iter().zip(&inverse[cells]);
+                for (line, (&r, &d)) in line.iter_mut().zip(input) {
+                    *line = if d > 0.0 { Into::<f64>::into(inward * r) as f32 } else { 0.0 };
                 }
-                None => line.fill(0.0),
+            } else {
+                line.fill(0.0);
             }
+            let row = row.wrapping_sub(around);
             let line = between.next();
-            match inside((first + step).checked_sub(3 * around)).map(of) {
-                Some(row) => {
-                    before.filter(line);
-                    line.iter_mut().zip(&self.inverse[row]).for_each(|(line, d)| *line *= d);
-                }
-                None => line.fill(0.0),
+            if row < r.len() / cols {
+                before.filter(line);
+                let of_row = &inverse[row * cols..(row + 1) * cols];
+                line.iter_mut().zip(of_row).for_each(|(line, d)| *line *= d);
+            } else {
+                line.fill(0.0);
             }
             if let Some(own) = step.checked_sub(4 * around) {
                 between.filter(&mut found);
-                let output = found.iter().zip(&self.inverse[of(first + own)]);
-                for (z, (found, d)) in z[of(own)].iter_mut().zip(output) {
-                    let seen = if *d > 0.0 { *found } else { 0.0 };
-                    *z = outward * N::of(f64::from(seen));
+                let output = found.iter().zip(&inverse[(first + own) * cols..]);
+                for (z, (&found, &d)) in z[own * cols..(own + 1) * cols].iter_mut().zip(output) {
+                    *z = outward * N::of(f64::from(if d > 0.0 { found } else { 0.0 }));
                 }
             }
         }
@@ -300,35 +314,18 @@ impl FilterRows {
     }
 
     /// K at the row in the middle.
-    fn filter(&mut self, found: &mut [f32]) {
-        let Self { rows, line } = self;
-        let rows = rows.each_ref().map(|row| &row[..]);
-        pulp::Arch::new().dispatch(Filter { rows, line, found });
-    }
-}
-
-struct Filter<'s> {
-    rows: [&'s [f32]; FILTER.len()],
-    line: &'s mut [f32],
-    found: &'s mut [f32],
-}
-
-impl pulp::NullaryFnOnce for Filter<'_> {
-    type Output = ();
-
     #[inline(always)]
-    fn call(self) {
-        let cols = self.found.len();
+    fn filter(&mut self, found: &mut [f32]) {
+        let cols = found.len();
         let [s, t, u, v, w] = FILTER;
-        let [a, b, c, d, e] = self.rows.map(|row| &row[..cols]);
-        let line = &mut self.line[..cols + FILTER.len() - 1];
-        let inner = &mut line[FILTER.len() / 2..][..cols];
+        let [a, b, c, d, e] = self.rows.each_ref().map(|row| &row[..cols]);
+        let inner = &mut self.line[FILTER.len() / 2..][..cols];
         for col in 0..cols {
             inner[col] = s * a[col] + t * b[col] + u * c[col] + v * d[col] + w * e[col];
         }
-        let [a, b, c, d, e] = [0, 1, 2, 3, 4].map(|from| &line[from..from + cols]);
+        let [a, b, c, d, e] = [0, 1, 2, 3, 4].map(|from| &self.line[from..from + cols]);
         for col in 0..cols {
-            self.found[col] = s * a[col] + t * b[col] + u * c[col] + v * d[col] + w * e[col];
+            found[col] = s * a[col] + t * b[col] + u * c[col] + v * d[col] + w * e[col];
         }
     }
 }

@@ -48,7 +48,7 @@ impl Wide {
         let rows = self.beam.len() / cols;
         let bands = workers.map(rows.div_ceil(SUMMED), |band| {
             let mut found: Vec<(usize, Vec<f64>)> = Vec::new();
-            let mut sums = [(); 5].map(|()| vec![0.0; cols]);
+            let mut sums = [(); 5].map(|()| vec![N::default(); cols]);
             let band = band * SUMMED..rows.min((band + 1) * SUMMED);
             for row in band.clone() {
                 let (node, height) = hats.rows.at(row as f64);
@@ -57,13 +57,13 @@ impl Wide {
                     values: &r[cells.clone()],
                     beam: &self.beam[cells.clone()],
                     slopes: self.slopes.each_ref().map(|slopes| &slopes[cells.clone()]),
-                    height,
+                    height: N::of(height),
                     sums: sums.each_mut().map(|sums| &mut sums[..]),
                 });
                 let is_last = row + 1 == band.end;
                 if is_last || hats.rows.at((row + 1) as f64).0 != node {
                     found.extend(self.close(node, &sums));
-                    sums.iter_mut().for_each(|sums| sums.fill(0.0));
+                    sums.iter_mut().for_each(|sums| sums.fill(N::default()));
                 }
             }
             found
@@ -76,7 +76,7 @@ impl Wide {
     }
 
     /// Sums along the coarse rows above and below, each with its first hat.
-    fn close(&self, node: usize, sums: &[Vec<f64>; 5]) -> [(usize, Vec<f64>); 2] {
+    fn close<N: Value>(&self, node: usize, sums: &[Vec<N>; 5]) -> [(usize, Vec<f64>); 2] {
         let (nodes, spacing) = (self.hats.cols.nodes, self.hats.cols.spacing);
         let [levels, turns, fall] = [&sums[..2], &sums[2..4], &sums[4..]];
         [0, 1].map(|below| {
@@ -84,8 +84,8 @@ impl Wide {
             let sign = [1.0, -1.0][below] / self.hats.rows.spacing;
             for (col, &(node, share)) in self.hats.columns.iter().enumerate() {
                 let (node, share) = (node as usize, f64::from(share));
-                let value = levels[below][col] + sign * fall[0][col];
-                let moved = share * value - turns[below][col] / spacing;
+                let value = levels[below][col].into() + sign * fall[0][col].into();
+                let moved = share * value - turns[below][col].into() / spacing;
                 found[node] += value - moved;
                 found[node + 1] += moved;
             }
@@ -152,8 +152,8 @@ struct Level<'s, N> {
     values: &'s [N],
     beam: &'s [f32],
     slopes: [&'s [f32]; 2],
-    height: f64,
-    sums: [&'s mut [f64]; 5],
+    height: N,
+    sums: [&'s mut [N]; 5],
 }
 
 impl<N: Value> pulp::NullaryFnOnce for Level<'_, N> {
@@ -163,14 +163,16 @@ impl<N: Value> pulp::NullaryFnOnce for Level<'_, N> {
     fn call(self) {
         let [above, below, above_turn, below_turn, fall] = self.sums;
         let [down, along] = self.slopes;
+        let rest = N::of(1.0) - self.height;
         for col in 0..self.values.len() {
-            let r: f64 = self.values[col].into();
-            let (level, turn) = (r * f64::from(self.beam[col]), r * f64::from(along[col]));
-            above[col] += (1.0 - self.height) * level;
+            let r = self.values[col];
+            let of = |values: &[f32]| N::of(f64::from(values[col]));
+            let (level, turn) = (r * of(self.beam), r * of(along));
+            above[col] += rest * level;
             below[col] += self.height * level;
-            above_turn[col] += (1.0 - self.height) * turn;
+            above_turn[col] += rest * turn;
             below_turn[col] += self.height * turn;
-            fall[col] += r * f64::from(down[col]);
+            fall[col] += r * of(down);
         }
     }
 }
