@@ -8,6 +8,7 @@ use equipix_core::centroid::{Spot, locate};
 use equipix_core::control::Control;
 use equipix_core::error::Result;
 use equipix_core::frames::{Sample, Shape, Stack};
+use equipix_core::parallel::Workers;
 use numpy::{Element, PyReadonlyArray3, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 
@@ -25,7 +26,10 @@ pub(crate) enum Samples<'py> {
 /// Position and standard error, each (row, column).
 type PySpot = ([f64; 2], [f64; 2]);
 
-/// Finds the spot in `before` and in `after`; each has a saturation level of its own, or none.
+/// Finds the spot in one of the arguments.
+type Search<'a> = Box<dyn Fn(&Control) -> Result<Spot> + Send + Sync + 'a>;
+
+/// Finds the spot in `before` and in `after`, at the same time; each has a saturation level of its own, or none.
 #[pyfunction]
 #[pyo3(signature = (before, after, saturations))]
 pub(crate) fn locate_spots(
@@ -34,36 +38,39 @@ pub(crate) fn locate_spots(
     after: Samples<'_>,
     saturations: (Option<f64>, Option<f64>),
 ) -> PyResult<(PySpot, PySpot)> {
-    let before = spot(py, "before", &before, saturations.0)?;
-    let after = spot(py, "after", &after, saturations.1)?;
-    Ok(((before.position, before.std), (after.position, after.std)))
+    let searches =
+        [search("before", &before, saturations.0)?, search("after", &after, saturations.1)?];
+    let work = |control: &Control| -> Result<Vec<Spot>> {
+        let found = Workers::new(None)?.map(searches.len(), |index| searches[index](control));
+        found.into_iter().collect()
+    };
+    let spots = run::interruptible(py, None, work)?;
+    let of = |index: usize| (spots[index].position, spots[index].std);
+    Ok((of(0), of(1)))
 }
 
-fn spot(
-    py: Python<'_>,
+fn search<'a>(
     argument: &'static str,
-    frames: &Samples<'_>,
+    frames: &'a Samples<'_>,
     saturation: Option<f64>,
-) -> PyResult<Spot> {
+) -> PyResult<Search<'a>> {
     match frames {
-        Samples::U8(frames) => typed(py, argument, frames, saturation),
-        Samples::U16(frames) => typed(py, argument, frames, saturation),
-        Samples::F32(frames) => typed(py, argument, frames, saturation),
-        Samples::F64(frames) => typed(py, argument, frames, saturation),
+        Samples::U8(frames) => typed(argument, frames, saturation),
+        Samples::U16(frames) => typed(argument, frames, saturation),
+        Samples::F32(frames) => typed(argument, frames, saturation),
+        Samples::F64(frames) => typed(argument, frames, saturation),
     }
 }
 
-fn typed<T: Sample + Element>(
-    py: Python<'_>,
+fn typed<'a, T: Sample + Element>(
     argument: &'static str,
-    frames: &PyReadonlyArray3<'_, T>,
+    frames: &'a PyReadonlyArray3<'_, T>,
     saturation: Option<f64>,
-) -> PyResult<Spot> {
+) -> PyResult<Search<'a>> {
     let [count, rows, cols] = [0, 1, 2].map(|axis| frames.shape()[axis]);
     let data = frames.as_slice()?;
-    let work = |control: &Control| -> Result<Spot> {
+    Ok(Box::new(move |control| {
         let stack = Stack::new(argument, data, count, Shape::new(rows, cols))?;
         locate(argument, stack, saturation, control)
-    };
-    run::interruptible(py, None, work)
+    }))
 }
