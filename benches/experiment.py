@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from commands import Command, Row, measure
 
 import equipix
 from equipix import demo
@@ -17,8 +18,6 @@ from equipix.experiment.manifest import entry_files as find_files
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-Row = tuple[str, str, str, str]
 
 
 def rows(
@@ -49,6 +48,24 @@ def rows(
     ]
 
 
+LARGE = (((3000, 4000), 40, 2.5), ((6000, 8000), 180, 8))
+"""Shapes, and the seconds and gigabytes that are wanted of `equipix calibrate`."""
+
+
+def large_rows(wanted: tuple[tuple[tuple[int, int], float, float], ...] = LARGE) -> list[Row]:
+    """Run the usual way on large sensors: two frames, five positions, measured moves."""
+    rows = []
+    for shape, seconds, gigabytes in wanted:
+        with tempfile.TemporaryDirectory(prefix="equipix-") as scratch:
+            sizes = ("--shape", *map(str, shape), "--frames", "2")
+            measure(("simulate", "-o", "experiment", *sizes), Path(scratch))
+            manifest = "experiment/experiment.toml"
+            calibrate = ("calibrate", manifest, "-o", "calibration.tif")
+            command = Command("calibrate, measured moves", calibrate, seconds, gigabytes)
+            rows.append(command.row(Path(scratch), shape))
+    return rows
+
+
 def averaged(experiment: equipix.Experiment) -> list[equipix.FrameStatistics]:
     """Averages of the dark, subtracted, and of all exposures."""
     path, manifest = experiment.path, experiment.manifest
@@ -77,5 +94,5 @@ def timed(part: Callable[[], object]) -> float:
 
 
 if __name__ == "__main__":
-    for row in rows():
+    for row in [*rows(), *large_rows()]:
         print(" | ".join(row))

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 import tempfile
-import time
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
+from commands import Command, Row
 
 from equipix import simulate
 from equipix.io.tiff import write_frames
@@ -18,22 +15,11 @@ from equipix.io.tiff import write_frames
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-Row = tuple[str, str, str, str]
-
 SHAPE = (3000, 4000)
 FRAMES = 8
 LEVELS_E = (4e3, 8e3, 12e3, 16e3)
 STEADY_E = 10e3
 """Photoelectrons of the frames of one steady level, of which three times as many are made."""
-
-
-class Command(NamedTuple):
-    """A command, its arguments, and the seconds and gigabytes that are wanted."""
-
-    work: str
-    arguments: tuple[str, ...]
-    seconds: float
-    gigabytes: float | None = None
 
 
 COMMANDS = (
@@ -66,30 +52,7 @@ def rows(shape: tuple[int, int] = SHAPE, *, frames: int = FRAMES) -> list[Row]:
     """Run each command in a process of its own; give the rows: work, wanted, got, how."""
     with tempfile.TemporaryDirectory(prefix="equipix-") as scratch:
         write_data(Path(scratch), shape, frames)
-        return [measured(Path(scratch), each, f"{shape[1]}×{shape[0]}") for each in COMMANDS]
-
-
-def measured(folder: Path, command: Command, size: str) -> Row:
-    """Time of a command, and the most memory that its process ever held."""
-    start = time.perf_counter()
-    child = subprocess.Popen(
-        [sys.executable, "-m", "equipix", *command.arguments],
-        cwd=folder,
-        stdout=subprocess.DEVNULL,
-        env={**os.environ, "PYTHONWARNINGS": "ignore"},
-    )
-    _, status, used = os.wait4(child.pid, 0)
-    seconds = time.perf_counter() - start
-    child.returncode = os.waitstatus_to_exitcode(status)
-    if child.returncode:
-        raise subprocess.CalledProcessError(child.returncode, child.args)
-    limit = "" if command.gigabytes is None else f", {command.gigabytes:g} GB"
-    return (
-        f"equipix {command.work}, {size}",
-        f"<= {command.seconds:g} s{limit}",
-        f"{seconds:.1f} s, {1024 * used.ru_maxrss / 1e9:.2f} GB",
-        f"{used.ru_utime + used.ru_stime:.1f} s of processors; peak of resident memory",
-    )
+        return [command.row(Path(scratch), shape) for command in COMMANDS]
 
 
 def write_data(folder: Path, shape: tuple[int, int], frames: int) -> None:

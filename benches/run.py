@@ -46,6 +46,8 @@ def main(*, smoke: bool) -> None:
     rows += uncertainty.rows((48, 64), 1) if smoke else uncertainty.rows()
     rows += subpixel.rows((48, 64), repetitions=1) if smoke else subpixel.rows()
     rows += experiment.rows((96, 128), frames=2, repetitions=1) if smoke else experiment.rows()
+    small = (((96, 128), 1, 1),)
+    rows += experiment.large_rows(small) if smoke else experiment.large_rows()
     rows += large.rows((96, 128)) if smoke else large.rows()
     rows += planning.rows((96, 128), travel=20) if smoke else planning.rows()
     rows += levels.rows((96, 128), frames=3) if smoke else levels.rows()

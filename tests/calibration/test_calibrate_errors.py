@@ -103,6 +103,13 @@ def with_value(array, place, value):
         ({"variance": with_value(np.ones((5, 8, 9)), (1, 2, 3), -1)}, "row 2, column 3 is -1"),
         ({"variance": with_value(np.ones((5, 8, 9)), (1, 2, 3), np.nan)}, "row 2, column 3 is NaN"),
         ({"variance": with_value(np.ones((5, 8, 9)), (1, 2, 3), np.inf)}, "row 2, column 3 is inf"),
+        (
+            {
+                "frames": frames().astype(np.float32),
+                "variance": with_value(np.ones((5, 8, 9), np.float32), (1, 2, 3), 0),
+            },
+            "row 2, column 3 is 0",
+        ),
         ({"frames": 1e60 * frames()}, "choose another unit"),
         ({"frames": 1e-60 * frames()}, "choose another unit"),
         ({"flux": [1e300] * 5}, "'flux' of exposure 0 .from 0. is 1"),

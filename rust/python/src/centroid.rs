@@ -4,11 +4,12 @@
 //! |---|---|---|---|
 //! | before, after | uint8, uint16, float32 or float64, 3 | `Stack<u8>` … `Stack<f64>` | view |
 
+use std::panic::resume_unwind;
+
 use equipix_core::centroid::{Spot, locate};
 use equipix_core::control::Control;
 use equipix_core::error::Result;
 use equipix_core::frames::{Sample, Shape, Stack};
-use equipix_core::parallel::Workers;
 use numpy::{Element, PyReadonlyArray3, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 
@@ -40,13 +41,18 @@ pub(crate) fn locate_spots(
 ) -> PyResult<(PySpot, PySpot)> {
     let searches =
         [search("before", &before, saturations.0)?, search("after", &after, saturations.1)?];
-    let work = |control: &Control| -> Result<Vec<Spot>> {
-        let found = Workers::new(None)?.map(searches.len(), |index| searches[index](control));
-        found.into_iter().collect()
+    // Not in the pool of workers, whose threads would be deaf to others for as long as a search takes.
+    let work = |control: &Control| -> Result<[Spot; 2]> {
+        let [before, after] = &searches;
+        std::thread::scope(|scope| {
+            let other = scope.spawn(|| after(control));
+            let first = before(control);
+            let second = other.join().unwrap_or_else(|panic| resume_unwind(panic));
+            Ok([first?, second?])
+        })
     };
-    let spots = run::interruptible(py, None, work)?;
-    let of = |index: usize| (spots[index].position, spots[index].std);
-    Ok((of(0), of(1)))
+    let [before, after] = run::interruptible(py, None, work)?;
+    Ok(((before.position, before.std), (after.position, after.std)))
 }
 
 fn search<'a>(
