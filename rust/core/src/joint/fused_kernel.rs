@@ -6,7 +6,7 @@ use crate::geometry::TAPS;
 /// Values side by side, which vector registers hold.
 const LANES: usize = 16;
 /// Pixels that a row is taken by: what is found of them on the way stays in the nearest cache.
-pub(super) const BLOCK: usize = 256;
+const BLOCK: usize = 256;
 
 /// Σ_i t_i a_i of four rows of values.
 #[inline(always)]

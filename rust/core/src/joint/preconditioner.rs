@@ -223,6 +223,7 @@ impl<N: Value> pulp::NullaryFnOnce for Filtered<'_, N> {
         let mut found = vec![0.0; cols];
         // Rows that come in, counted from as many above as both filters reach.
         for step in 0..z.len() / cols + 4 * around {
+            // A row above the first one wraps to beyond the last.
             let row = (first + step).wrapping_sub(2 * around);
             let line = before.next();
             if row < r.len() / cols {
