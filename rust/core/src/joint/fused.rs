@@ -1,13 +1,13 @@
 //! A product with S in one pass in single precision, where only the beam is sought.
 //!
-//! With b = √(w/w₀) c and the light l = b B a/l₀ of the coefficients a, in units of an ordinary light l₀, a change x
-//! of the coefficients pulls back
+//! With the light l = c B a/l₀ of the coefficients a, in units of an ordinary light l₀, and weights b = w/w₀, a change
+//! x of the coefficients pulls back
 //!
 //! ```text
-//! S x = w₀ Bᵀ b M² (v − l α),   v = b B x,   α = i Σ l v,   i = w₀ l₀²/Σ w e²,   δM = −M α
+//! S x = w₀ Bᵀ c b M² (v − l α),   v = c B x,   α = i Σ b l v,   i = w₀ l₀²/Σ w e²,   δM = −M α
 //! ```
 //!
-//! with sums over the exposures of a pixel. Taps along rows and along columns are applied one after the other. A band
+//! with sums over the exposures of a pixel. Weights that are the same in an exposure are kept in its taps, as √b c. Taps along rows and along columns are applied one after the other. A band
 //! of pixels keeps the last rows of cells as seen along a row, of x and of a, and the last rows of pulls. M, Σ w e²
 //! and the right-hand side are found in double precision at each step, which makes good what the one before left by
 //! rounding (iterative refinement).
@@ -21,25 +21,22 @@ use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
 use crate::geometry::{Rotation, TAPS};
-use crate::parallel::Workers;
 
 /// Rows of pixels in a band, at least.
 const BAND: usize = 64;
 /// Rows of cells that a thread folds at a time.
 const FOLDED: usize = 32;
-/// Rows of pixels that a thread converts at a time.
+/// Rows of cells that a thread converts at a time.
 const CONVERTED: usize = 16;
 
 /// What a fused product needs of one linearisation.
 pub(super) struct Fused {
     bands: Bands,
-    /// Values of a row of one quantity.
-    width: usize,
-    /// a/l₀ of the state last linearised.
+    /// a/l₀.
     beam: Vec<f32>,
-    /// b of each exposure, by row of pixels; empty unless weights differ within an exposure.
-    gains: Vec<f32>,
-    /// Taps along rows and columns of each exposure, those along rows times b where it is the same.
+    /// Whether weights differ within an exposure.
+    is_uneven: bool,
+    /// Taps along rows and columns of each exposure, those along rows times c, or √b c.
     taps: [Vec<[f32; TAPS]>; 2],
     /// An ordinary light, and w₀.
     light: f64,
@@ -57,42 +54,31 @@ impl Fused {
         pass.grid.is_spline() && !is_turned && !seeks_more
     }
 
-    /// For exposures at the places where the pass has them.
+    /// For exposures at the places where the pass has them, and these coefficients.
     pub(super) fn new<T: Real>(
         pass: &Pass<'_, '_, T>,
+        coefficients: &[f64],
         [light, weight]: [f64; 2],
         control: &Control,
     ) -> Self {
         let (sensor, count) = (pass.exposures.sensor(), pass.exposures.count());
         let bands = Bands::new(&pass.windows, &pass.grid.geometry.views, pass.grid.width, BAND);
-        let width = sensor.cols;
         let is_uneven = (0..count).any(|k| pass.exposures.uniform_weight(k).is_none());
-        let gain = |k: usize, w: Option<f64>| w.map_or(1.0, |w| (w / weight).sqrt() * pass.flux[k]);
-        let along = |k: usize| {
-            let gain = gain(k, pass.exposures.uniform_weight(k).filter(|_| !is_uneven));
-            pass.windows[k].along_rows.values.map(|tap| (gain * tap) as f32)
+        let gain = |k: usize| {
+            let even = pass.exposures.uniform_weight(k).filter(|_| !is_uneven);
+            pass.flux[k] * even.map_or(1.0, |w| (w / weight).sqrt())
         };
+        let along = |k: usize| pass.windows[k].along_rows.values.map(|tap| (gain(k) * tap) as f32);
         let across = |k: usize| pass.windows[k].along_cols.values.map(|tap| tap as f32);
-        let length = if is_uneven { count * width } else { 0 };
-        let mut gains = pass.workers.filled(sensor.rows * length, 0.0, control);
-        pass.workers.map_blocks(&mut gains, CONVERTED * length.max(1), |block, rows| {
-            let mut workspace = pass.workspace();
-            for (index, row) in rows.chunks_exact_mut(length).enumerate() {
-                if control.is_cancelled() {
-                    return;
-                }
-                pass.weigh_row(block * CONVERTED + index, &mut workspace);
-                let weights = workspace.weights.chunks_exact(sensor.cols);
-                for (k, (gains, weights)) in row.chunks_exact_mut(width).zip(weights).enumerate() {
-                    let gains = gains.iter_mut().zip(weights);
-                    gains.for_each(|(b, &w)| *b = gain(k, Some(w)) as f32);
-                }
-            }
+        let mut beam = pass.workers.filled(coefficients.len(), 0.0, control);
+        let converted = CONVERTED * pass.grid.geometry.beam.cols;
+        pass.workers.map_blocks(&mut beam, converted, |block, cells| {
+            let coefficients = coefficients[block * converted..].iter();
+            cells.iter_mut().zip(coefficients).for_each(|(cell, a)| *cell = (a / light) as f32);
         });
         Self {
-            width,
-            beam: Vec::new(),
-            gains,
+            beam,
+            is_uneven,
             taps: [(0..count).map(along).collect(), (0..count).map(across).collect()],
             light,
             weight,
@@ -101,22 +87,12 @@ impl Fused {
         }
     }
 
-    /// Takes the coefficients of a state that was linearised.
-    pub(super) fn renew(&mut self, beam: &[f64], workers: &Workers) {
-        self.beam.resize(beam.len(), 0.0);
-        workers.map_blocks(&mut self.beam, CONVERTED * self.width, |block, cells| {
-            let first = block * CONVERTED * self.width;
-            let beam = beam[first..].iter();
-            cells.iter_mut().zip(beam).for_each(|(cell, a)| *cell = (a / self.light) as f32);
-        });
-    }
-
     /// S x in units of w₀ times an ordinary light, for x in units of that light, and the change of M in each
     /// [`Row`]; returns the largest size of that less `share` of the change before.
     pub(super) fn multiply<T: Real>(
         &mut self,
         pass: &mut Pass<'_, '_, T>,
-        penalty: (&Penalty, &[f64]),
+        penalty: (&Penalty, &[f32]),
         x: &[f32],
         share: f64,
         product: &mut [f32],
@@ -151,10 +127,11 @@ impl Fused {
     ) -> f64 {
         let (cols, count) = (pass.exposures.sensor().cols, pass.exposures.count());
         let stride = pass.grid.geometry.beam.cols;
-        let mut seen = [&self.beam[..], x].map(|cells| (cells, Ring::new(count, self.width)));
-        let mut pulls = Ring::new(count, self.width + 2 * AROUND);
+        let mut seen = [&self.beam[..], x].map(|cells| (cells, Ring::new(count, cols)));
+        let mut pulls = Ring::new(count, cols + 2 * AROUND);
+        let mut weights = if self.is_uneven { pass.row_of_weights() } else { Vec::new() };
         let mut block = Block::new(count);
-        let mut line = vec![0.0; self.width + 2 * AROUND];
+        let mut line = vec![0.0; cols + 2 * AROUND];
         let (first, mut largest) = (band * self.bands.height, 0.0_f64);
         let height = rows.len();
         strips.fill(0.0);
@@ -174,12 +151,15 @@ impl Fused {
                 return largest;
             }
             look(&mut seen, index + AROUND);
-            let gains = self.gains.chunks_exact(count * self.width).nth(first + index);
+            if self.is_uneven {
+                pass.weigh_row(first + index, &mut weights);
+            }
             largest = largest.max(pulp::Arch::new().dispatch(Eliminate {
                 seen: [&seen[0].1, &seen[1].1],
                 index,
                 taps: &self.taps[0],
-                gains,
+                weights: &weights,
+                shares: 1.0 / self.weight,
                 row: Row::of(row, cols),
                 unit: self.weight * self.light * self.light,
                 share,
@@ -223,7 +203,7 @@ impl Fused {
     fn fold<T: Real>(
         &self,
         pass: &Pass<'_, '_, T>,
-        (penalty, scale): (&Penalty, &[f64]),
+        (penalty, scale): (&Penalty, &[f32]),
         x: &[f32],
         product: &mut [f32],
     ) {

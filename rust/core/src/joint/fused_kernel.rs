@@ -69,20 +69,20 @@ impl Ring {
 
 /// Buffers for a block of pixels.
 pub(super) struct Block {
-    /// l and v of each exposure.
-    seen: Vec<[[f32; BLOCK]; 2]>,
+    /// l, v and b of each exposure.
+    seen: Vec<[[f32; BLOCK]; 3]>,
     /// α, M and M².
     pixels: [[f32; BLOCK]; 3],
 }
 
 impl Block {
     pub(super) fn new(exposures: usize) -> Self {
-        Self { seen: vec![[[0.0; BLOCK]; 2]; exposures], pixels: [[0.0; BLOCK]; 3] }
+        Self { seen: vec![[[0.0; BLOCK]; 3]; exposures], pixels: [[0.0; BLOCK]; 3] }
     }
 }
 
 /// What pixels see of the beam and of a change of it, l and v, and what they pull back once M has followed by
-/// −M α: v → M² (v − l α) with α = i Σ l v over the exposures of a pixel. Returns the largest size of the change of M
+/// −M α: v → b M² (v − l α) with α = i Σ b l v over the exposures of a pixel. Returns the largest size of the change of M
 /// less a share of the change before.
 pub(super) struct Eliminate<'s> {
     /// Rows of cells as seen along the row of pixels, of the beam and of its change, of which the first tap takes
@@ -91,8 +91,9 @@ pub(super) struct Eliminate<'s> {
     pub(super) index: usize,
     /// Taps along rows of each exposure.
     pub(super) taps: &'s [[f32; TAPS]],
-    /// √(w/w₀) c of each measurement, unless that is the same for an exposure and in its taps.
-    pub(super) gains: Option<&'s [f32]>,
+    /// w of each measurement and 1/w₀; empty where b is the same for an exposure and in its taps.
+    pub(super) weights: &'s [f64],
+    pub(super) shares: f64,
     /// M, its normal matrix and its last change.
     pub(super) row: Row<'s>,
     /// i times Σ w e².
@@ -108,8 +109,9 @@ impl pulp::NullaryFnOnce for Eliminate<'_> {
 
     #[inline(always)]
     fn call(self) -> f64 {
-        let Self { seen, index, taps, gains, row, unit, share, block, pulls } = self;
+        let Self { seen, index, taps, weights, shares, row, unit, share, block, pulls } = self;
         let width = seen[0].width;
+        let is_uneven = !weights.is_empty();
         let Block { seen: found, pixels: [along, m, square] } = block;
         let mut largest = 0.0_f64;
         let rows = row.change.chunks_mut(BLOCK).zip(row.sensitivity.chunks(BLOCK));
@@ -119,17 +121,20 @@ impl pulp::NullaryFnOnce for Eliminate<'_> {
             let (first, cols) = (number * BLOCK, last.len());
             let (along, m, square) = (&mut along[..cols], &mut m[..cols], &mut square[..cols]);
             along.fill(0.0);
-            for (k, ([level, value], &taps)) in found.iter_mut().zip(taps).enumerate() {
+            for (k, ([level, value, even], &taps)) in found.iter_mut().zip(taps).enumerate() {
                 let (level, value) = (&mut level[..cols], &mut value[..cols]);
                 combine(taps, seen[0].block(k, index, first, cols), level);
                 combine(taps, seen[1].block(k, index, first, cols), value);
-                if let Some(gains) = gains {
-                    let gains = &gains[k * width + first..][..cols];
-                    level.iter_mut().zip(gains).for_each(|(level, gain)| *level *= gain);
-                    value.iter_mut().zip(gains).for_each(|(value, gain)| *value *= gain);
+                let both = along.iter_mut().zip(level.iter().zip(&*value));
+                if is_uneven {
+                    let weights = &weights[k * width + first..][..cols];
+                    for ((b, w), (sum, (level, value))) in even.iter_mut().zip(weights).zip(both) {
+                        *b = (shares * w) as f32;
+                        *sum += *b * level * value;
+                    }
+                } else {
+                    both.for_each(|(sum, (level, value))| *sum += level * value);
                 }
-                let both = level.iter().zip(&*value);
-                along.iter_mut().zip(both).for_each(|(sum, (level, value))| *sum += level * value);
             }
             let pixels = along.iter_mut().zip(&mut *m).zip(&mut *square);
             for (((along, m), square), (of_row, inverse)) in
@@ -139,7 +144,7 @@ impl pulp::NullaryFnOnce for Eliminate<'_> {
                 *m = *of_row as f32;
                 *square = *m * *m;
             }
-            for (k, [level, value]) in found.iter().enumerate() {
+            for (k, [level, value, even]) in found.iter().enumerate() {
                 let pull = &mut pulls.row_mut(k, index)[AROUND + first..][..cols];
                 let pixels = square.iter().zip(&*along);
                 for ((pull, (square, along)), (level, value)) in
@@ -147,9 +152,8 @@ impl pulp::NullaryFnOnce for Eliminate<'_> {
                 {
                     *pull = square * (value - level * along);
                 }
-                if let Some(gains) = gains {
-                    let gains = &gains[k * width + first..][..cols];
-                    pull.iter_mut().zip(gains).for_each(|(pull, gain)| *pull *= gain);
+                if is_uneven {
+                    pull.iter_mut().zip(even).for_each(|(pull, b)| *pull *= b);
                 }
             }
             largest = largest.max(follow(last, [m, along], share));
@@ -206,7 +210,7 @@ impl pulp::NullaryFnOnce for Back<'_> {
 
 /// Takes multiples of two others off.
 pub(super) struct Subtract<'s> {
-    pub(super) others: [&'s [f64]; 2],
+    pub(super) others: [&'s [f32]; 2],
     pub(super) multiples: [f64; 2],
     pub(super) product: &'s mut [f32],
 }
@@ -216,10 +220,10 @@ impl pulp::NullaryFnOnce for Subtract<'_> {
 
     #[inline(always)]
     fn call(self) {
-        let [s, t] = self.multiples;
+        let [s, t] = self.multiples.map(|multiple| multiple as f32);
         let [a, b] = self.others;
         for (product, (a, b)) in self.product.iter_mut().zip(a.iter().zip(b)) {
-            *product = (f64::from(*product) - s * a - t * b) as f32;
+            *product -= s * a + t * b;
         }
     }
 }

@@ -67,6 +67,6 @@ pub(crate) fn values_at_cells<T: Real>(system: &System<'_, '_, T>) -> Vec<f64> {
 /// The coefficients of the beam, if it is a spline; NaN where no measurement sees them.
 pub(crate) fn coefficients<T: Real>(system: &System<'_, '_, T>) -> Option<Vec<f64>> {
     let cells = system.state.beam.iter().zip(&system.weights);
-    let seen = |(&value, &weight): (&f64, &f64)| if weight > 0.0 { value } else { f64::NAN };
+    let seen = |(&value, &weight): (&f64, &f32)| if weight > 0.0 { value } else { f64::NAN };
     system.pass.grid.is_spline().then(|| cells.map(seen).collect())
 }

@@ -342,27 +342,34 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
                 }
             }
         }
-        self.leave_lost_out(row, workspace);
+        self.leave_lost_out(row, weights);
     }
 
-    /// The weights of one row of each exposure; those that are all the same stand in the workspace.
-    pub(crate) fn weigh_row(&self, row: usize, workspace: &mut Workspace) {
+    /// A buffer for the weights of one row of each exposure; those that are all the same stand in it.
+    pub(crate) fn row_of_weights(&self) -> Vec<f64> {
+        let weight = |k| self.exposures.uniform_weight(k).unwrap_or(0.0);
+        let count = 0..self.exposures.count();
+        count.flat_map(|k| std::iter::repeat_n(weight(k), self.exposures.sensor().cols)).collect()
+    }
+
+    /// The weights of one row of each exposure, in a buffer for them.
+    pub(crate) fn weigh_row(&self, row: usize, weights: &mut [f64]) {
         let cols = self.exposures.sensor().cols;
-        for (k, weights) in workspace.weights.chunks_exact_mut(cols).enumerate() {
+        for (k, weights) in weights.chunks_exact_mut(cols).enumerate() {
             if self.exposures.uniform_weight(k).is_none() {
                 let _ = self.exposures.stretch(k, row, 0..cols, weights);
             }
         }
-        self.leave_lost_out(row, workspace);
+        self.leave_lost_out(row, weights);
     }
 
     /// Takes the weights of lost measurements out of those of a row.
-    fn leave_lost_out(&self, row: usize, workspace: &mut Workspace) {
+    fn leave_lost_out(&self, row: usize, weights: &mut [f64]) {
         if self.few.lost.is_empty() {
             return;
         }
         let cols = self.exposures.sensor().cols;
-        for (k, weights) in workspace.weights.chunks_exact_mut(cols).enumerate() {
+        for (k, weights) in weights.chunks_exact_mut(cols).enumerate() {
             if let Some(weight) = self.exposures.uniform_weight(k) {
                 // The row before may have lost others.
                 weights.fill(weight);
@@ -374,9 +381,8 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
     pub(crate) fn workspace(&self) -> Workspace {
         let (cols, count) = (self.exposures.sensor().cols, self.exposures.count());
         let moved = if self.with_shifts { count * cols } else { 0 };
-        let weight = |k| self.exposures.uniform_weight(k).unwrap_or(0.0);
         Workspace {
-            weights: (0..count).flat_map(|k| std::iter::repeat_n(weight(k), cols)).collect(),
+            weights: self.row_of_weights(),
             light: vec![0.0; count * cols],
             lines: [(); TAPS].map(|()| Lines::new(count, cols)),
             line: vec![0.0; cols + 2 * AROUND],

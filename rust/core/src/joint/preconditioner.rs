@@ -109,11 +109,10 @@ impl Preconditioner {
         let rim = Rim::new(system, control)?;
         let invert = |d: f64| if d > 0.0 { 1.0 / d } else { 0.0 };
         let weights = &system.weights;
-        let least = FAINTEST * weights.iter().sum::<f64>() / weights.len() as f64;
-        let [_, weight] = system.ordinary;
+        let least = FAINTEST * system.total_weight() / weights.len() as f64;
         let mut inverse = around(&rim, beam);
         for (inverse, d) in inverse.iter_mut().zip(weights) {
-            *inverse *= if *d > least { (weight / d) as f32 } else { 0.0 };
+            *inverse *= if f64::from(*d) > least { 1.0 / d } else { 0.0 };
         }
         let params = whole.into_iter().map(invert).collect();
         let (wide, filters) = (Wide::new(hats, system, control), system.pass.grid.is_spline());

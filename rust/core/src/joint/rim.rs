@@ -20,7 +20,7 @@ use crate::parallel::{Value, Workers};
 /// and on a grid of which the rim is the larger part it costs iterations.
 const NEAR: usize = 3;
 pub(super) const NEAR_OF_TURNED: usize = 2;
-const SHARE: f64 = 1.0 / 6.0;
+const SHARE: f32 = 1.0 / 6.0;
 /// A rim of more cells than these of each row and column fills the image: then its diagonal has to do.
 pub(crate) const WIDEST: usize = 16;
 /// What is added to the diagonal, as a share of it, for cells that rounding alone determines.

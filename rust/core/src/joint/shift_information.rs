@@ -128,7 +128,8 @@ impl<T: Real> System<'_, '_, T> {
                 });
                 if r.is_finite() && c.is_finite() {
                     let middle = cell + step;
-                    let weight = self.weights[middle] * beam[middle].powi(2) / 6.0;
+                    let weight = self.ordinary[1] * f64::from(self.weights[middle]);
+                    let weight = weight * beam[middle].powi(2) / 6.0;
                     sums = [
                         sums[0] + weight * r * r,
                         sums[1] + weight * r * c,

@@ -27,7 +27,7 @@ impl<T: Real> System<'_, '_, T> {
             for row_index in block_row * size[0]..sensor.rows.min((block_row + 1) * size[0]) {
                 control.check()?;
                 let row = self.pass.row(row_index);
-                self.pass.weigh_row(row_index, &mut workspace);
+                self.pass.weigh_row(row_index, &mut workspace.weights);
                 self.pass.see_beam(&beams, row_index, &mut workspace);
                 for k in 0..count {
                     let mut few = self.pass.few.in_row(row_index).iter().peekable();

@@ -112,13 +112,10 @@ impl Precision for f32 {
         control: &Control,
     ) -> Result<f64> {
         let Some(penalty) = &system.penalty else { return Ok(f64::INFINITY) };
-        let fused =
-            system.fused.get_or_insert_with(|| Fused::new(&system.pass, system.ordinary, control));
-        if !system.is_fused_anew {
-            fused.renew(&system.state.beam, system.pass.workers);
-            control.check()?;
-            system.is_fused_anew = true;
-        }
+        let fused = system.fused.get_or_insert_with(|| {
+            Fused::new(&system.pass, &system.state.beam, system.ordinary, control)
+        });
+        control.check()?;
         product.resize(x.len(), 0.0);
         fused.multiply(&mut system.pass, (penalty, &system.scale), x, share, product, control)
     }
@@ -140,16 +137,15 @@ pub(crate) struct System<'m, 'a, T> {
     pull: Vec<f64>,
     /// The mean M of the pixels with measurements.
     pub(crate) mean: f64,
-    /// Σ w c² M² of the pixels that see a cell, by their factors.
-    pub(crate) weights: Vec<f64>,
-    /// D a/(aᵀD a) with these weights D and the coefficients a.
-    pub(crate) scale: Vec<f64>,
+    /// D/w₀ with D = Σ w c² M² of the pixels that see a cell, by their factors, and an ordinary weight w₀.
+    pub(crate) weights: Vec<f32>,
+    /// s l₀ = D a l₀/(aᵀD a) with the coefficients a and an ordinary light l₀.
+    pub(crate) scale: Vec<f32>,
     pub(crate) penalty: Option<Penalty>,
-    /// A faster product where it serves, and whether it is of the state last linearised.
+    /// A faster product at the state last linearised, where it serves.
     fused: Option<Fused>,
-    is_fused_anew: bool,
     /// An ordinary light and an ordinary weight.
-    pub(super) ordinary: [f64; 2],
+    pub(crate) ordinary: [f64; 2],
     /// Whether the weights and τ are of the state last linearised.
     is_weighed_anew: bool,
     /// Whether the penalty counts more cells than at the state linearised before.
@@ -185,7 +181,6 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             scale: Vec::new(),
             penalty: None,
             fused: None,
-            is_fused_anew: false,
             ordinary: [exposures.typical_light(), exposures.typical_weight()],
             is_weighed_anew: false,
             sees_more: false,
@@ -253,9 +248,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     /// [`Error::Cancelled`](crate::Error::Cancelled), here and below.
     pub(crate) fn linearise(&mut self, control: &Control) -> Result<(f64, Vec<f64>)> {
         self.pass.place(&self.state.shifts);
-        // Its bands are those of the shifts.
-        self.fused.take_if(|_| self.shift_prior.is_some());
-        (self.is_fused_anew, self.is_weighed_anew) = (false, false);
+        (self.fused, self.is_weighed_anew) = (None, false);
         self.pass.flux = self.fluxes.at(&self.state.theta);
         let mut pull = self.pass.workers.filled(self.state.beam.len(), 0.0, control);
         let found = self.eliminate_pixels(&mut pull, control)?;
@@ -326,26 +319,26 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     fn whole(&mut self, control: &Control) -> Result<(f64, Vec<f64>)> {
         let mut scale = std::mem::take(&mut self.scale);
         scale.resize(self.weights.len(), 0.0);
-        let cols = self.pass.grid.geometry.beam.cols;
-        self.pass.workers.map_blocks(&mut scale, cols, |row, scale| {
-            let cells = self.weights[row * cols..].iter().zip(&self.state.beam[row * cols..]);
-            scale.iter_mut().zip(cells).for_each(|(scale, (d, a))| *scale = d * a);
-        });
-        let norm = self.pass.workers.dot(&scale, &self.state.beam);
-        self.pass.workers.map_blocks(&mut scale, cols, |_, scale| {
-            scale.iter_mut().for_each(|scale| *scale /= norm);
+        let (cols, workers) = (self.pass.grid.geometry.beam.cols, self.pass.workers);
+        let cells = |row: usize| {
+            let cells = row * cols..(row + 1) * cols;
+            let cells = self.weights[cells.clone()].iter().zip(&self.state.beam[cells]);
+            cells.map(|(d, a)| (f64::from(*d) * a, a))
+        };
+        let norms: Vec<f64> =
+            workers.map(scale.len() / cols, |row| cells(row).map(|(da, a)| da * a).sum());
+        let norm: f64 = norms.into_iter().sum();
+        let unit = self.ordinary[0] / norm;
+        workers.map_blocks(&mut scale, cols, |row, scale| {
+            scale.iter_mut().zip(cells(row)).for_each(|(s, (da, _))| *s = (da * unit) as f32);
         });
         self.scale = scale;
-        if let Some(penalty) = &mut self.penalty {
-            penalty.turn_to(&self.state.beam, self.pass.workers);
-            control.check()?;
-        }
-        let mut slope = self.pass.workers.filled(self.pull.len(), 0.0, control);
+        let mut slope = workers.filled(self.pull.len(), 0.0, control);
         slope.copy_from_slice(&self.pull);
         let mut objective = self.misfit + self.of_prior + self.pull_by_priors(&mut slope);
-        if let Some(penalty) = &self.penalty {
-            let slope = &mut slope[..self.state.beam.len()];
-            objective += penalty.pull(&self.scale, slope, self.pass.workers);
+        if let Some(penalty) = &mut self.penalty {
+            let (beam, weights) = (&self.state.beam, (&self.weights[..], norm));
+            objective += penalty.turn_to(beam, weights, &mut slope[..beam.len()], workers);
         }
         self.balance(&mut slope[..self.state.beam.len()]);
         control.check()?;
@@ -354,7 +347,8 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
 
     /// x − a (aᵀD x)/(aᵀD a), without the multiple of the beam, which is not determined.
     pub(crate) fn take_scale_out<N: Value>(&self, x: &mut [N]) {
-        let multiple = self.pass.workers.dot(&self.scale, x);
+        let [light, _] = self.ordinary;
+        let multiple = self.pass.workers.dot(&self.scale, x) / light;
         self.pass.workers.add_multiple(x, -multiple, &self.state.beam);
     }
 
@@ -441,7 +435,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         let shares = self.shares(&x[cells..]);
         let views = self.pass.views_of(&x[..cells]);
         self.pass.run(&self.state.beam, pull, control, |pass, row_index, row, workspace, found| {
-            pass.weigh_row(row_index, workspace);
+            pass.weigh_row(row_index, &mut workspace.weights);
             workspace.begin(&shares, moves);
             pass.see(&views, row_index, workspace);
             let (light, weights, values, sums) = workspace.parts();
@@ -468,7 +462,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         let views = self.pass.views_of(&x[..cells]);
         let (beam, mut pull) = (&self.state.beam, vec![0.0; cells]);
         self.pass.run(beam, &mut pull, control, |pass, row_index, mut row, workspace, _| {
-            pass.weigh_row(row_index, workspace);
+            pass.weigh_row(row_index, &mut workspace.weights);
             workspace.begin(&shares, &moves);
             pass.see(&views, row_index, workspace);
             let (light, weights, values, sums) = workspace.parts();
@@ -504,15 +498,14 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
 
     /// D, Σ w c² M² over the pixels that see a cell, by their factors, and the penalty that goes with it.
     fn weigh(&mut self, control: &Control) -> Result<()> {
-        let mut weights = std::mem::take(&mut self.weights);
-        weights.resize(self.state.beam.len(), 0.0);
+        let mut sums = self.pass.workers.filled(self.state.beam.len(), 0.0, control);
         self.pass.run(
             &self.state.beam,
-            &mut weights,
+            &mut sums,
             control,
             |pass, row_index, row, workspace, _| {
                 let cols = pass.exposures.sensor().cols;
-                pass.weigh_row(row_index, workspace);
+                pass.weigh_row(row_index, &mut workspace.weights);
                 let (lights, weights, values, _) = workspace.parts();
                 for (k, (weights, flux)) in weights.chunks_exact(cols).zip(&pass.flux).enumerate() {
                     let pixels = weights.iter().zip(&*row.sensitivity);
@@ -525,21 +518,36 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
                 }
             },
         )?;
-        self.weights = weights;
+        let [light, unit] = self.ordinary;
+        // What is seen at all stays so.
+        let relative = |d: f64| (d / unit).clamp(f64::from(f32::MIN_POSITIVE), f64::from(f32::MAX));
+        self.weights.resize(sums.len(), 0.0);
+        let cols = self.pass.grid.geometry.beam.cols;
+        self.pass.workers.map_blocks(&mut self.weights, cols, |row, weights| {
+            for (weight, &d) in weights.iter_mut().zip(&sums[row * cols..]) {
+                *weight = if d > 0.0 { relative(d) as f32 } else { 0.0 };
+            }
+        });
+        drop(sums);
         self.is_weighed_anew = self.penalty.is_none();
         if self.pass.grid.is_spline() {
-            let total: f64 = self.weights.iter().sum();
-            let typical = self.pass.workers.dot(&self.weights, &self.weights) / total;
+            let square = self.pass.workers.dot(&self.weights, &self.weights);
+            let typical = unit * square / self.total_weight();
             // τ stays until it is asked for anew, or F would not be one function.
             let tau = self.penalty.as_ref().map_or(SMOOTHING * typical, |penalty| penalty.tau);
             let shape = self.pass.grid.geometry.beam;
-            let mut penalty = Penalty::new(shape, &self.weights, tau, self.pass.workers, control);
+            let mut penalty = Penalty::new(shape, &self.weights, [tau, light], self.pass.workers, control);
             // Nor would it be one if cells left it that come out of sight.
             let last = self.penalty.take();
             self.sees_more = last.is_some_and(|last| penalty.count_where(&last));
             self.penalty = Some(penalty);
         }
         control.check()
+    }
+
+    /// Σ D/w₀ over all cells.
+    pub(crate) fn total_weight(&self) -> f64 {
+        self.weights.iter().map(|&d| f64::from(d)).sum()
     }
 
     /// w (c M)² of up to four pixels of a row of an exposure.

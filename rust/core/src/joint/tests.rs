@@ -193,9 +193,9 @@ fn the_preconditioner_is_symmetric_and_the_same_in_single_precision() {
         let pulls = |seed: usize| -> Vec<f64> {
             let cells = 0..system.size();
             let white: Vec<f64> = cells.map(|cell| random(cell + seed) - 0.5).collect();
-            let multiple = dot(&white, &system.state.beam);
+            let multiple = dot(&white, &system.state.beam) / system.ordinary[0];
             let scale = system.scale.iter();
-            white.iter().zip(scale).map(|(r, scale)| r - multiple * scale).collect()
+            white.iter().zip(scale).map(|(r, scale)| r - multiple * f64::from(*scale)).collect()
         };
         let (r, s) = (pulls(17), pulls(4711));
         let (mut of_r, mut of_s) = (Vec::new(), Vec::new());
@@ -210,7 +210,9 @@ fn the_preconditioner_is_symmetric_and_the_same_in_single_precision() {
         let mut single = Vec::new();
         preconditioner.apply(system, &short, &mut single, &control).unwrap();
         let pairs = single.iter().zip(&of_r).zip(&system.weights);
-        let off = pairs.map(|((one, z), d)| d * (step * f64::from(*one) - z).powi(2)).sum::<f64>();
+        let square = |off: f64, d: f32| system.ordinary[1] * f64::from(d) * off * off;
+        let off: f64 =
+            pairs.map(|((one, z), d)| square(step * f64::from(*one) - z, *d)).sum();
         assert!(off.sqrt() < rounding * dot(&r, &of_r).sqrt(), "{}", off.sqrt());
     });
 }

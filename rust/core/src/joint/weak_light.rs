@@ -135,7 +135,8 @@ impl<T: Real> System<'_, '_, T> {
     /// A prior of M pulls at the multiple of the beam, which is held: what pulls at cells is without that.
     pub(super) fn balance<N: Value>(&self, pull: &mut [N]) {
         if self.prior.is_some() {
-            let multiple = self.pass.workers.dot(&self.state.beam, pull);
+            let [light, _] = self.ordinary;
+            let multiple = self.pass.workers.dot(&self.state.beam, pull) / light;
             self.pass.workers.add_multiple(pull, -multiple, &self.scale);
         }
     }

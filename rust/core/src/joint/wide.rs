@@ -7,7 +7,7 @@
 use super::system::System;
 use crate::coarse::Hats;
 use crate::control::Control;
-use crate::frames::{Real, Shape};
+use crate::frames::Real;
 use crate::parallel::{Value, Workers};
 
 /// Rows of cells whose sums over hats a thread makes at a time.
@@ -16,10 +16,9 @@ const SUMMED: usize = 32;
 pub(crate) struct Wide {
     pub(crate) hats: Hats,
     cols: usize,
-    /// a, and ∂a/3 along rows and columns where the beam is a spline, in units of an ordinary light and single
-    /// precision; 0 for cells that are not seen.
+    /// a in units of an ordinary light and single precision; 0 for cells that are not seen.
     pub(super) beam: Vec<f32>,
-    slopes: [Vec<f32>; 2],
+    is_spline: bool,
 }
 
 impl Wide {
@@ -27,19 +26,31 @@ impl Wide {
         let (beam, cols) = (&system.state.beam, system.pass.grid.geometry.beam.cols);
         let seen = |cell: usize| system.weights.get(cell).is_some_and(|&weight| weight > 0.0);
         let [light, _] = system.ordinary;
-        let level = |cell: usize| if seen(cell) { (beam[cell] / light) as f32 } else { 0.0 };
-        let slope = |cell: usize, step: usize| {
-            let (place, length) = if step == 1 { (cell % cols, cols) } else { (cell, beam.len()) };
-            let inside = system.pass.grid.is_spline() && place >= step && place + step < length;
-            if inside && [cell - step, cell, cell + step].into_iter().all(seen) {
-                ((beam[cell + step] - beam[cell - step]) / (6.0 * light)) as f32
-            } else {
-                0.0
+        let mut levels = system.pass.workers.filled(beam.len(), 0.0, control);
+        system.pass.workers.map_blocks(&mut levels, cols, |row, levels| {
+            for (level, cell) in levels.iter_mut().zip(row * cols..) {
+                *level = if seen(cell) { (beam[cell] / light) as f32 } else { 0.0 };
             }
-        };
-        let [down, along] =
-            [cols, 1].map(|step| on_cells(system, control, |cell| slope(cell, step)));
-        Self { hats, cols, beam: on_cells(system, control, level), slopes: [down, along] }
+        });
+        Self { hats, cols, beam: levels, is_spline: system.pass.grid.is_spline() }
+    }
+
+    /// a of a row of cells.
+    fn row(&self, row: usize) -> &[f32] {
+        &self.beam[row * self.cols..][..self.cols]
+    }
+
+    /// Finds ∂a/3 down and along a row of cells of a spline, 0 beside cells that are not seen.
+    fn find_slopes(&self, row: usize, slopes: &mut [Vec<f32>; 2]) {
+        let last = self.beam.len() / self.cols - 1;
+        if !self.is_spline {
+            return;
+        }
+        // Beyond the first row and the last one nothing is seen.
+        let rows = [row.checked_sub(1), Some(row), (row < last).then_some(row + 1)];
+        let none = &vec![0.0; if row == 0 || row == last { self.cols } else { 0 }];
+        let rows = rows.map(|row| row.map_or(&none[..], |row| self.row(row)));
+        pulp::Arch::new().dispatch(Slopes { rows, slopes });
     }
 
     /// Φᵀ r.
@@ -49,14 +60,15 @@ impl Wide {
         let bands = workers.map(rows.div_ceil(SUMMED), |band| {
             let mut found: Vec<(usize, Vec<f64>)> = Vec::new();
             let mut sums = [(); 5].map(|()| vec![N::default(); cols]);
+            let mut slopes = [(); 2].map(|()| vec![0.0; cols]);
             let band = band * SUMMED..rows.min((band + 1) * SUMMED);
             for row in band.clone() {
                 let (node, height) = hats.rows.at(row as f64);
-                let cells = row * cols..(row + 1) * cols;
+                self.find_slopes(row, &mut slopes);
                 pulp::Arch::new().dispatch(Level {
-                    values: &r[cells.clone()],
-                    beam: &self.beam[cells.clone()],
-                    slopes: self.slopes.each_ref().map(|slopes| &slopes[cells.clone()]),
+                    values: &r[row * cols..][..cols],
+                    beam: self.row(row),
+                    slopes: slopes.each_ref().map(|slopes| &slopes[..]),
                     height: N::of(height),
                     sums: sums.each_mut().map(|sums| &mut sums[..]),
                 });
@@ -98,6 +110,7 @@ impl Wide {
         let cols = self.cols;
         let mut last = usize::MAX;
         let mut lines = [(); 4].map(|()| vec![N::default(); cols]);
+        let mut slopes = [(); 2].map(|()| vec![0.0; cols]);
         for (row, z) in z.chunks_exact_mut(cols).enumerate() {
             let row = first + row;
             let (node, height) = self.hats.rows.at(row as f64);
@@ -105,11 +118,11 @@ impl Wide {
                 self.open(node, heights, &mut lines);
                 last = node;
             }
-            let cells = row * cols..(row + 1) * cols;
+            self.find_slopes(row, &mut slopes);
             pulp::Arch::new().dispatch(Smooth {
                 z,
-                beam: &self.beam[cells.clone()],
-                slopes: self.slopes.each_ref().map(|slopes| &slopes[cells.clone()]),
+                beam: self.row(row),
+                slopes: slopes.each_ref().map(|slopes| &slopes[..]),
                 height: N::of(height),
                 slope: N::of(1.0 / self.hats.rows.spacing),
                 lines: lines.each_ref().map(|line| &line[..]),
@@ -131,19 +144,34 @@ impl Wide {
     }
 }
 
-/// A value for each cell.
-fn on_cells<T: Real>(
-    system: &System<'_, '_, T>,
-    control: &Control,
-    value: impl Fn(usize) -> f32 + Sync + Send,
-) -> Vec<f32> {
-    let Shape { cols, .. } = system.pass.grid.geometry.beam;
-    let mut values = system.pass.workers.filled(system.state.beam.len(), 0.0, control);
-    system.pass.workers.map_blocks(&mut values, cols, |row, values| {
-        let cells = values.iter_mut().zip(row * cols..);
-        cells.for_each(|(each, cell)| *each = value(cell));
-    });
-    values
+/// A third of the slopes down and along the row in the middle of three, 0 beside a 0.
+struct Slopes<'s> {
+    rows: [&'s [f32]; 3],
+    slopes: &'s mut [Vec<f32>; 2],
+}
+
+impl pulp::NullaryFnOnce for Slopes<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        let [down, along] = self.slopes;
+        let [above, own, below] = self.rows;
+        let third = |before: f32, own: f32, after: f32| {
+            let is_seen = (before != 0.0) & (own != 0.0) & (after != 0.0);
+            if is_seen { (after - before) * (1.0 / 6.0) } else { 0.0 }
+        };
+        for (down, ((above, own), below)) in down.iter_mut().zip(above.iter().zip(own).zip(below)) {
+            *down = third(*above, *own, *below);
+        }
+        let [Some(before), Some(middle), Some(after)] = [0, 1, 2].map(|from| own.get(from..)) else {
+            return;
+        };
+        let inner = along.iter_mut().skip(1).zip(before.iter().zip(middle).zip(after));
+        for (along, ((before, own), after)) in inner {
+            *along = third(*before, *own, *after);
+        }
+    }
 }
 
 /// Sums of r a down a coarse cell, by the heights of the hats above and below, of r ∂a/3 along rows

@@ -373,8 +373,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         let mut pull = pull_of(&mut self.system, &none, &offset, control)?;
         let system = &mut self.system;
         let (flux, workers) = (&system.pass.flux, system.pass.workers);
-        let light =
-            workers.dot(&system.weights, &system.state.beam) / system.weights.iter().sum::<f64>();
+        let light = workers.dot(&system.weights, &system.state.beam) / system.total_weight();
         let of_beam = -flux.iter().map(|c| 1.0 / c).sum::<f64>() / flux.len() as f64;
         let logs: Vec<f64> = flux.iter().map(|c| (-1.0 / c - of_beam) / light).collect();
         let mut along: Vec<f64> =

@@ -46,7 +46,7 @@ impl Dark {
             &mut no_pull,
             control,
             |pass, row_index, row, workspace, found| {
-                pass.weigh_row(row_index, workspace);
+                pass.weigh_row(row_index, &mut workspace.weights);
                 workspace.values().clear();
                 let cols = row.change.len();
                 let variance = &variance[row_index * cols..];

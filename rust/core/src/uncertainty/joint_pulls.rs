@@ -46,7 +46,7 @@ pub(super) fn pull_by<T: Real>(
     let (beam, mut pull) = (&system.state.beam, vec![0.0; system.state.beam.len()]);
     let found =
         system.pass.run(beam, &mut pull, control, |pass, row_index, row, workspace, _| {
-            pass.weigh_row(row_index, workspace);
+            pass.weigh_row(row_index, &mut workspace.weights);
             work(pass, row_index, row, workspace);
         })?;
     system.append(&found, &mut pull);
@@ -78,10 +78,12 @@ pub(super) fn variance_by_cells<T: Real>(
     system: &mut System<'_, '_, T>,
     control: &Control,
 ) -> Result<Vec<f64>> {
-    let views = system.pass.views_of(&system.weights);
+    let [_, unit] = system.ordinary;
+    let weights: Vec<f64> = system.weights.iter().map(|&d| unit * f64::from(d)).collect();
+    let views = system.pass.views_of(&weights);
     let (beam, mut no_pull) = (&system.state.beam, vec![0.0; system.weights.len()]);
     system.pass.run(beam, &mut no_pull, control, |pass, row_index, row, workspace, _| {
-        pass.weigh_row(row_index, workspace);
+        pass.weigh_row(row_index, &mut workspace.weights);
         workspace.values().clear();
         pass.see(&views, row_index, workspace);
         let cols = row.change.len();
