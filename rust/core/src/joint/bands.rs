@@ -1,7 +1,10 @@
 //! How the sensor is cut into bands of rows for a pass, and where the sums of a band lie.
 
 use super::layout::Window;
-use crate::geometry::View;
+use crate::geometry::Geometry;
+
+/// The most bands, if shifts allow so many: the rows that two bands both add to are kept twice.
+const MOST: usize = 64;
 
 /// How the sensor is cut into bands, and where their sums lie.
 #[derive(Default)]
@@ -25,8 +28,9 @@ pub(crate) struct Strip {
 }
 
 impl Bands {
-    /// Bands of `fewest` rows at least: a band adds to as many rows of cells and those that shifts reach.
-    pub(crate) fn new(windows: &[Window], views: &[View], width: usize, fewest: usize) -> Self {
+    /// Bands of `fewest` rows of a sensor at least: a band adds to as many rows of cells and those that shifts reach.
+    pub(crate) fn new(windows: &[Window], geometry: &Geometry, width: usize, fewest: usize) -> Self {
+        let views = &geometry.views;
         let reach = |view: usize| {
             let rows = windows.iter().filter(|window| window.view == view).map(|window| window.row);
             let first = rows.clone().min().unwrap_or(0);
@@ -34,7 +38,7 @@ impl Bands {
         };
         let reaches: Vec<_> = (0..views.len()).map(reach).collect();
         let furthest = reaches.iter().map(|reach| reach.1).max().unwrap_or(0);
-        let height = fewest.max(furthest);
+        let height = fewest.max(furthest).max(geometry.sensor.rows / MOST);
         let mut length = 0;
         let strips = views.iter().zip(reaches).map(|(view, (first, reach))| {
             let (rows, cols, start) = (height + reach + width - 1, view.shape.cols, length);

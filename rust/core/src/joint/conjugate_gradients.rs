@@ -54,14 +54,17 @@ impl<N: Precision> ConjugateGradients<N> {
         control: &Control,
     ) -> Result<()> {
         self.sees_large_scales = preconditioner.sees_large_scales();
-        let zeros = || system.pass.workers.filled(slope.len(), N::default(), control);
-        self.x = zeros();
-        if self.direction.len() != slope.len() {
-            (self.direction, self.product) = (zeros(), zeros());
-        }
-        control.check()?;
+        // First, since it takes the slope's place.
         let [_, unit] = system.units::<N>();
         self.residual = slope.into_iter().map(|slope| N::of(slope / unit)).collect();
+        control.check()?;
+        let zeros = || system.pass.workers.filled(self.residual.len(), N::default(), control);
+        let x = zeros();
+        if self.direction.len() != x.len() {
+            (self.direction, self.product) = (zeros(), zeros());
+        }
+        self.x = x;
+        control.check()?;
         preconditioner.apply(system, &self.residual, &mut self.direction, control)?;
         self.square = system.pass.workers.dot(&self.residual, &self.direction);
         self.keep = 0.0;

@@ -62,7 +62,7 @@ impl Fused {
         control: &Control,
     ) -> Self {
         let (sensor, count) = (pass.exposures.sensor(), pass.exposures.count());
-        let bands = Bands::new(&pass.windows, &pass.grid.geometry.views, pass.grid.width, BAND);
+        let bands = Bands::new(&pass.windows, &pass.grid.geometry, pass.grid.width, BAND);
         let is_uneven = (0..count).any(|k| pass.exposures.uniform_weight(k).is_none());
         let gain = |k: usize| {
             let even = pass.exposures.uniform_weight(k).filter(|_| !is_uneven);

@@ -10,9 +10,9 @@ use crate::frames::Real;
 /// | array | in bytes |
 /// |---|---|
 /// | M, its normal matrix, its change; O and two more elements | 24 or 48 for each pixel |
-/// | the beam, weights, their multiple of it, the penalty, the preconditioner | 50 for each cell |
-/// | while products are in single precision: a gain of each measurement | 4 |
-/// | … the sums of all bands in both precisions (`pass.rs`, `fused.rs`), the beam, slopes, the last step | 12 · 2.2 at most + 28 for each cell |
+/// | the beam, weights, their multiple of it, the penalty, the preconditioner | 30 for each cell |
+/// | while products are in single precision: the sums of all bands of a pass (`pass.rs`), slopes, the last step | 8 · 2.2 at most + 16 for each cell |
+/// | … or those of a product (`fused.rs`), the beam, four vectors of a search | 4 · 2.2 at most + 20 for each cell |
 /// | while they are in double precision: four vectors of a search, slopes, the last step and its slope | 64 for each cell |
 /// | … the sums of all bands | 8 · 2.2 at most for each cell of each view |
 /// | … with turned exposures, the beam and a vector in each view, and what was found there | 24 for each cell of each view |
@@ -22,14 +22,14 @@ use crate::frames::Real;
 pub(crate) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>) -> u64 {
     let geometry = exposures.geometry();
     let (pixels, cells) = (geometry.sensor.len() as u64, geometry.beam.len() as u64);
-    let (count, views) = (exposures.count() as u64, geometry.views.len() as u64);
+    let views = geometry.views.len() as u64;
     let of_pixel = if exposures.offset() { 48 } else { 24 };
     let turned = if views > 1 { 24 * views } else { 0 };
-    let single = 4 * count * pixels + 55 * cells;
+    let single = 34 * cells;
     let double = (64 + 18 * views + turned) * cells;
     let rim = 2000 * WIDEST as u64 * (geometry.beam.rows + geometry.beam.cols) as u64;
     of_pixel * pixels
-        + 50 * cells
+        + 30 * cells
         + single.max(double)
         + rim
         + coarse::bytes_needed(geometry, MOST_WAVES)

@@ -89,7 +89,7 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
     pub(crate) fn place(&mut self, shifts: &[[f64; 2]]) {
         let Grid { geometry, width, .. } = &self.grid;
         self.windows = self.grid.windows(shifts);
-        self.bands = Bands::new(&self.windows, &geometry.views, *width, FEWEST_ROWS);
+        self.bands = Bands::new(&self.windows, geometry, *width, FEWEST_ROWS);
     }
 
     /// Frees the sums of bands, until the next pass.

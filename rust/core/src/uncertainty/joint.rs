@@ -134,11 +134,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         if self.system.pass.with_offset {
             return Ok(());
         }
-        let mut dark = Dark::of(&mut self.system, variance, control)?;
-        let propagated: Vec<f64> = dark.propagated().collect();
-        let in_gauge = self.tilts.gauge.diagonal(&propagated);
-        dark.in_gauge = in_gauge.map(|variance| (variance / self.scale) as f32).collect();
-        self.dark = Some(dark);
+        self.dark = Some(Dark::of(&mut self.system, variance, control)?);
         Ok(())
     }
 
@@ -161,6 +157,11 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
     /// The standard deviation of M by pixel, in units of that of a value of weight 1.
     pub(super) fn error_map(&mut self, control: &Control) -> Result<ErrorMap> {
         self.known = Known::default();
+        if let Some(dark) = &mut self.dark {
+            let propagated: Vec<f64> = dark.propagated().collect();
+            let in_gauge = self.tilts.gauge.diagonal(&propagated);
+            dark.in_gauge = in_gauge.map(|variance| (variance / self.scale) as f32).collect();
+        }
         let sensor = self.system.pass.exposures.sensor();
         let sampled = if is_smoothed(sensor) {
             smoothed(self, sensor, control)?

@@ -11,7 +11,6 @@
 //! noise. To the variance of gᵀM it adds Σ_p v (a g + 1ᵀ w Q J x)² with S x = Cᵀ g, to F on average
 //! eᵀ 1ᵀ w Q 1 e less b · S⁻¹ b with b = Jᵀ w Q 1 e.
 
-use super::joint_pulls::add_change;
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::{Real, Shape};
@@ -21,12 +20,12 @@ use crate::random;
 /// The noise of a dark.
 pub(super) struct Dark {
     /// The standard deviation of e, by pixel.
-    std: Vec<f64>,
+    std: Vec<f32>,
     /// a.
-    propagation: Vec<f64>,
+    propagation: Vec<f32>,
     /// The mean of eᵀ 1ᵀ w Q 1 e.
     pub(super) left: f64,
-    /// The variance of a e in the gauge, in the units of the map.
+    /// The variance of a e in the gauge, in the units of the map, for which it is found.
     pub(super) in_gauge: Vec<f32>,
 }
 
@@ -66,32 +65,41 @@ impl Dark {
                 found.objective += left.iter().sum::<f64>();
             },
         )?;
-        let mut propagation = vec![0.0; variance.len()];
-        add_change(system, &mut propagation);
-        let std = variance.iter().map(|v| v.sqrt()).collect();
+        let mut propagation = Vec::with_capacity(variance.len());
+        system.pass.for_rows(|[_, _, change, ..]| {
+            propagation.extend(change.iter().map(|&change| change as f32));
+        });
+        let std = variance.iter().map(|v| v.sqrt() as f32).collect();
         Ok(Self { std, propagation, left: found.objective, in_gauge: Vec::new() })
     }
 
     /// The variance of a e.
     pub(super) fn propagated(&self) -> impl Iterator<Item = f64> {
-        self.propagation.iter().zip(&self.std).map(|(a, std)| (a * std).powi(2))
+        self.factors().map(|[a, std]| (a * std).powi(2))
     }
 
     /// e of a row of pixels in one draw.
     pub(super) fn errors(&self, draw: u64, row: usize, sensor: Shape) -> impl Iterator<Item = f64> {
         let mut sign = random::signs_in_common(draw, row, sensor.rows);
-        self.std[row * sensor.cols..][..sensor.cols].iter().map(move |std| sign() * std)
+        let std = &self.std[row * sensor.cols..][..sensor.cols];
+        std.iter().map(move |&std| sign() * f64::from(std))
     }
 
     /// a e in one draw.
     pub(super) fn propagate(&self, draw: u64, sensor: Shape) -> Vec<f64> {
         let errors = (0..sensor.rows).flat_map(|row| self.errors(draw, row, sensor));
-        errors.zip(&self.propagation).map(|(error, a)| a * error).collect()
+        errors.zip(&self.propagation).map(|(error, &a)| f64::from(a) * error).collect()
     }
 
     /// What it adds to the variance of Σ g M where 1ᵀ w Q J x is `influence`.
     pub(super) fn variance_of(&self, gain: &[f64], influence: &[f64]) -> f64 {
-        let pixels = self.propagation.iter().zip(&self.std).zip(gain.iter().zip(influence));
-        pixels.map(|((a, std), (g, h))| ((a * g + h) * std).powi(2)).sum()
+        let pixels = self.factors().zip(gain.iter().zip(influence));
+        pixels.map(|([a, std], (g, h))| ((a * g + h) * std).powi(2)).sum()
+    }
+
+    /// a and the standard deviation of e, by pixel.
+    fn factors(&self) -> impl Iterator<Item = [f64; 2]> {
+        let pixels = self.propagation.iter().zip(&self.std);
+        pixels.map(|(&a, &std)| [a, std].map(f64::from))
     }
 }
