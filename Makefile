@@ -3,14 +3,14 @@ PYTHON ?= python3
 BIN := .venv/bin
 SOURCES := $(shell find rust python -name '*.rs' -o -name '*.py') Cargo.toml Cargo.lock pyproject.toml
 
-# Share of the seeds or parameter sets of each study that `make test` runs.
+# Share of the seeds or parameter sets of each study that `make test-long` runs.
 STUDIES ?= 0.1
 
 # Two processes of tests share two processors: threads of BLAS would wait for each other, and dense algebra take
 # five times as long.
-test study: export OPENBLAS_NUM_THREADS := 1
+test test-long study: export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test study bench figures docs lint audit build clean
+.PHONY: demo test test-long study bench figures docs lint audit build clean
 
 # Scripts: that every name and argument that they use is there.
 LOOSELY := --config-file= --check-untyped-defs --explicit-package-bases --ignore-missing-imports \
@@ -21,8 +21,13 @@ demo: $(BIN)/.built-release
 
 test: $(BIN)/.built-ci
 	cargo test --locked
+	$(BIN)/python -m pytest -m "not (timing or long or study)" -n 2 --dist worksteal
+
+# What takes seconds each, or must have the machine for itself.
+test-long: $(BIN)/.built-ci
 	$(BIN)/python -m pytest -m timing
-	$(BIN)/python -m pytest -m "not timing" -n 2 --dist worksteal --study-share $(STUDIES)
+	$(BIN)/python -m pytest -m "(long or study) and not timing" -n 2 --dist worksteal \
+		--study-share $(STUDIES)
 
 study: $(BIN)/.built-ci
 	$(BIN)/python -m pytest -m study -n 2 --dist worksteal --study-share 1 \

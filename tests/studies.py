@@ -1,8 +1,8 @@
 """Studies: tests over many simulated experiments, of which a share is run.
 
 A study bears the marker `study`. It either takes its seeds from the fixture `draws`, or has
-parameters. `make test` runs a tenth of each, `make study` all of them, and writes the figures that
-they hand to the fixture `figure` into a record.
+parameters. `make test-long` runs a tenth of each, `make study` all of them, and writes the figures
+that they hand to the fixture `figure` into a record.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture
 def draws(request):
-    """Seeds of a study: `draws(200)` is `range(200)`, or the first tenth of it in `make test`.
+    """Seeds of a study: `draws(200)` is `range(200)`, or the first tenth of it in `make test-long`.
 
     Seeds that follow one another visit all cases of a study that takes turns by `seed % 5`.
     """

@@ -628,6 +628,7 @@ def check_pairs(files, limits, run):
     assert [each["verdict"] for each in pair["limits"]][-2:] == ["FAIL", "PASS"]
 
 
+@pytest.mark.long
 def test_a_page_and_words_have_the_verdict(tmp_path, run, monkeypatch):
     files = [tmp_path / f"{name}.tif" for name in ("one", "other", "tilted", "plain")]
     calibrations = [measured(1, 4), measured(2, 5), measured(3, 5, lamp=3e-5)]

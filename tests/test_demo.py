@@ -25,6 +25,7 @@ def result(tmp_path_factory):
     return demo.run_demo(folder, shape=SHAPE, frames=10, rng=3)
 
 
+@pytest.mark.long
 def test_error_is_what_the_noise_predicts(result):
     assert result.passed
     figures = result.figures()
@@ -75,6 +76,7 @@ def test_the_hole_is_seen_whole_and_on_good_pixels(shape, seed):
         np.testing.assert_allclose(measured.shift, moved, atol=0.08 * np.sqrt(2))
 
 
+@pytest.mark.long
 def test_command_leaves_a_picture_only(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as done:
@@ -86,6 +88,7 @@ def test_command_leaves_a_picture_only(tmp_path, capsys, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["equipix-demo.png"]
 
 
+@pytest.mark.long
 def test_command_fails_when_the_errors_are_too_large(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(demo, "BLOCK_RMS_LIMIT", 0.1)
     monkeypatch.chdir(tmp_path)
@@ -98,6 +101,7 @@ def test_command_fails_when_the_errors_are_too_large(tmp_path, capsys, monkeypat
     assert (tmp_path / "kept/experiment.toml").is_file()
 
 
+@pytest.mark.long
 def test_command_replaces_what_it_kept(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     command = ["demo", "--shape", "64", "80", "--frames", "4", "--keep", "kept", "--force"]

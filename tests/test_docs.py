@@ -98,6 +98,7 @@ def write_night(folder: Path) -> None:
         fits.writeto(folder / f"{name}.fits", frame, fits.Header(cards))
 
 
+@pytest.mark.long
 def test_the_commands_of_readme_and_pages_run(tmp_path):
     write_night(tmp_path / "night")
     commands = [block for block in blocks("sh", *GUIDE) if block.startswith("equipix")]
@@ -165,6 +166,7 @@ def test_the_page_describes_every_figure_of_a_camera(tmp_path):
     assert {*re.findall(r"`(\w+)`", cells)} == {each.key for each in figures_of(found)}
 
 
+@pytest.mark.long
 def test_the_errors_of_the_page_are_those_of_the_example(capsys):
     runpy.run_path(str(ROOT / "examples/precision.py"), run_name="__main__")
     _, *lines = capsys.readouterr().out.splitlines()
@@ -246,6 +248,7 @@ def test_links_to_sections_lead_to_headings(page):
         assert section in slugs
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("module", MODULES)
 def test_the_examples_of_docstrings_run(module):
     result = doctest.testmod(importlib.import_module(module))
@@ -282,6 +285,7 @@ def figures(name, capsys):
     return [[float(each) for each in re.findall(r"[-+]?\d\.\d+(?:e-\d+)?", line)] for line in lines]
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
 def test_the_example_between_pixels(capsys):
     rounded, measured, refined, true, left = (each[0] for each in figures("subpixel", capsys))
@@ -322,6 +326,7 @@ def test_the_example_runs(tmp_path, monkeypatch, capsys):
     assert equipix.load(tmp_path / "cal.tif").converged
 
 
+@pytest.mark.long
 def test_the_plan_of_the_examples_comes_true(capsys):
     runpy.run_path(str(ROOT / "examples/plan.py"), run_name="__main__")
     rms, predicted = re.findall(r"\d\.\d+e-\d+", capsys.readouterr().out.splitlines()[-1])

@@ -164,6 +164,7 @@ def calibrations(limits, shifts=CROSS, *, uneven=False, **options):
     return json.loads(run(CHILDREN, json.dumps(given)).stdout)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("turn", [0, 90])
 def test_the_bytes_named_are_those_it_takes(turn):
     """All that is counted is used, and the allocator's share covers what is not."""
@@ -175,6 +176,7 @@ def test_the_bytes_named_are_those_it_takes(turn):
     assert int(needed) - allocator <= int(grown) <= int(needed)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "sought",
     [
@@ -190,6 +192,7 @@ def test_a_joint_fit_takes_no_more_bytes_than_it_names(sought):
     assert int(grown) <= int(re.match(words, refused)[1])
 
 
+@pytest.mark.long
 def test_a_process_is_refused_or_finishes_whatever_its_limit():
     """Nobody dies of too few bytes in between."""
     answers = calibrations([*range(60, 320, 20)])
@@ -232,6 +235,7 @@ equipix.calibrate(frames, {CROSS.tolist()}, tolerance=1e-3, workers=1)
     assert (done.returncode, done.stderr) == (0, "")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("options", "stacks", "masks", "images"),
     [
@@ -290,6 +294,7 @@ cli.main(["nuc", *sys.argv[2:]])
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("command", "work"), [("quality", "measuring quality"), ("defects", "finding bad pixels")]
 )
@@ -319,6 +324,7 @@ def peak_of(arguments):
         tracemalloc.stop()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("command", ["quality", "defects"])
 @pytest.mark.parametrize("filters", [[], ["--cfa", "RGGB"]], ids=["plain", "colours"])
 @pytest.mark.parametrize("dtype", [np.uint16, np.float32])
@@ -339,6 +345,7 @@ def test_memory_does_not_grow_with_the_frames_of_a_level(tmp_path, command, filt
     assert many - few < frames[0].nbytes + 2**17  # and the names of the files
 
 
+@pytest.mark.long
 def test_memory_of_levels_is_that_of_their_means(tmp_path):
     """Each level more is a mean and a variance, of 8 and 4 bytes; nothing else grows with it."""
     shape, peaks = (300, 400), {}
@@ -358,6 +365,7 @@ def test_memory_of_levels_is_that_of_their_means(tmp_path):
     assert peaks[10] - peaks[2] < 8 * (8 + 4 + 8) * pixels + 2 * pixels
 
 
+@pytest.mark.long
 def test_the_cost_of_words_holds_one_level(tmp_path):
     """Beside its corrected frames: of another level not even half of the raw frames are held."""
     shape = (150, 200)

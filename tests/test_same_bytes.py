@@ -63,6 +63,7 @@ def checkout(folder, addition=""):
     return str(folder)
 
 
+@pytest.mark.long
 def test_a_build_gives_the_same_bytes_as_itself(outcome, tmp_path, capsys):
     own = checkout(tmp_path / "own")
     assert same_bytes.main(["--with-builds", own, own, "--strict", "--only", *CASES]) == 0
@@ -71,6 +72,7 @@ def test_a_build_gives_the_same_bytes_as_itself(outcome, tmp_path, capsys):
     assert all(notes["error"] is None for notes in outcome.notes.values())
 
 
+@pytest.mark.long
 def test_a_build_that_alters_one_value_is_found(tmp_path, capsys):
     folders = [checkout(tmp_path / "old"), checkout(tmp_path / "new", ALTERED)]
     command = ["--with-builds", *folders, "--only", "whole float32", "noise and shifts"]
@@ -84,6 +86,7 @@ def test_a_build_that_alters_one_value_is_found(tmp_path, capsys):
     assert same_bytes.main([*command, "--allow", "sensitivity"]) == 0
 
 
+@pytest.mark.long
 def test_each_build_runs_the_cases_of_its_own_checkout(tmp_path, capsys):
     """The name of a function differs, the results do not."""
     old, new = checkout(tmp_path / "old"), checkout(tmp_path / "new", RENAMED)

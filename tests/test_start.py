@@ -205,6 +205,7 @@ class TestNames:
         assert out == cal.sensitivity.tobytes()
 
 
+@pytest.mark.long
 def test_user_code_is_checked_strictly(tmp_path):
     pytest.importorskip("mypy")
     (tmp_path / "user.py").write_text(USER)

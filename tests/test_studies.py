@@ -64,6 +64,7 @@ def test_a_larger_share_holds_a_smaller_one(suite, pytester):
     assert pages[0] < pages[1]
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("suite")
 def test_workers_keep_the_same_and_write_the_same_page(pytester):
     pages = []

@@ -82,6 +82,7 @@ def laid_out(frames, layout):
 
 
 class TestAgainstReference:
+    @pytest.mark.long
     @settings(max_examples=150, deadline=None)
     @given(experiments(), st.integers(1, 8))
     @pytest.mark.filterwarnings("ignore::equipix.errors.IdentifiabilityWarning")
@@ -252,6 +253,7 @@ class TestErrorEstimate:
         assert 1 / 3 <= cal.error_estimate / true <= 10
         assert not cal.converged
 
+    @pytest.mark.long
     def test_the_hard_case_converges(self):
         frames, truth = hard_case((240, 320))
         cal = equipix.calibrate(

@@ -204,6 +204,7 @@ class TestReducedChi2:
 
         self.chi2(run)
 
+    @pytest.mark.long
     def test_averaged_frames(self):
         def run(rng, truth, beam):
             clean = 3000 * simulate.exposures(truth, beam, WIDE)
@@ -216,6 +217,7 @@ class TestReducedChi2:
         # that adds 0.0009/√5 in quadrature to four standard deviations of 0.0014 and is left out.
         self.chi2(run)
 
+    @pytest.mark.long
     @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
     def test_noise_models_on_plain_arrays(self):
         """Variances at the noisy values bias the signals, which looks like a drift of the lamp."""
@@ -242,6 +244,7 @@ class TestReducedChi2:
 
 
 class TestNoiseModel:
+    @pytest.mark.long
     @pytest.mark.parametrize("electrons", [30, 100])
     def test_weights_at_expectations_make_m_better(self, electrons):
         """At few electrons a weight taken at the value itself goes with that value's noise."""

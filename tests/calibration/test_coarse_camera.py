@@ -29,6 +29,7 @@ def calibrated(*, binning=1, **camera):
     return cal, error[good] / cal.sensitivity_std[good]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("gain", "frames", "bits"), [(0.0025, 100, 12), (0.0025, 20, 8)])
 def test_rounding_that_all_exposures_share_is_no_misfit(gain, frames, bits):
     """M follows it: reduced chi-square is 0.53 and 0.84, and error bars are right or too large."""
@@ -37,6 +38,7 @@ def test_rounding_that_all_exposures_share_is_no_misfit(gain, frames, bits):
     assert 0.9 < np.sqrt(np.mean(z**2)) < 1.03
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("frames", [20, 300])
 def test_one_dark_frame_makes_error_bars_too_large_and_not_too_small(frames):
     """Its noise was that of a line through bright light, up to five times too large, or none."""
@@ -46,6 +48,7 @@ def test_one_dark_frame_makes_error_bars_too_large_and_not_too_small(frames):
     assert 0.5 < np.sqrt(np.mean(z**2)) < 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_a_dark_that_is_finer_than_its_rounding_shows_no_pattern(seed):
     """Read noise of 0.02 DN in a dark of 10 DN with a pattern of 0.3 DN: it is 9, 10 or 11 DN."""
@@ -67,12 +70,14 @@ def test_a_dark_that_is_finer_than_its_rounding_shows_no_pattern(seed):
     assert equipix.calibrate(frames, cross).findings == ()
 
 
+@pytest.mark.long
 def test_clipped_values_do_not_say_that_variances_are_too_large():
     cal, _ = calibrated(exposure_e=19500)
     assert "saturation" in {finding.kind for finding in cal.findings}
     assert not any("variances are too large" in finding.message for finding in cal.findings)
 
 
+@pytest.mark.long
 def test_shifts_of_binned_pixels_are_no_matter_of_noise():
     cal, _ = calibrated(binning=2, frames=4)
     assert not any("variances are too small" in finding.message for finding in cal.findings)

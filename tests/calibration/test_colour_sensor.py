@@ -199,6 +199,7 @@ class TestCalibrate:
         assert "'mask'" in words
         assert "plan.suggest" in words
 
+    @pytest.mark.long
     def test_each_colour_by_itself_has_a_beam_of_its_own(self):
         truth, _ = sensor("RGGB", dead=0)
         shifts = plan.suggest(SHAPE, 5, 12, cfa="RGGB", drift=1e-5)[0].shifts
@@ -409,6 +410,7 @@ class TestOthers:
         assert "36 (R 16, G 4, B 16)" in out
 
 
+@pytest.mark.long
 def test_the_examples_of_the_page_run():
     page = Path(__file__).parents[2] / "docs/colour.md"
     found = doctest.testfile(str(page), module_relative=False)

@@ -50,6 +50,7 @@ def minimiser(frames, shifts, mask):
     return equipix.calibrate(frames, shifts, mask=mask, tolerance=1e-12)
 
 
+@pytest.mark.long
 def test_the_minimiser_that_errors_are_measured_from_is_that_of_dense_algebra():
     for seed in range(12):
         frames, shifts, mask = random_experiment(seed, smallest=8, largest=12)

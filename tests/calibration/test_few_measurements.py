@@ -79,6 +79,7 @@ def test_standard_deviations_of_discs_with_masks_of_their_own(draws, figure):
         assert abs(z - 1) < 0.03 + error
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::equipix.errors.EquipixWarning")
 def test_free_fluxes_and_refined_shifts_converge():
     rng = np.random.default_rng(1)
@@ -91,6 +92,7 @@ def test_free_fluxes_and_refined_shifts_converge():
     assert cal.sweeps < KEPT
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::equipix.errors.EquipixWarning")
 def test_experiments_of_two_exposures_keep_all_pixels():
     frames, shifts, _, _ = discs(2)
@@ -152,6 +154,7 @@ def lost_by_the_rule(used, shifts, rotation, *, fitted):
         lost = found
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::equipix.errors.EquipixWarning")
 @pytest.mark.parametrize("shifts", [APART, MIXED], ids=["apart", "mixed"])
 @pytest.mark.parametrize("rotation", [[0] * 5, [0, 90, 180, 270, 0]], ids=["", "turned"])
@@ -166,6 +169,7 @@ def test_what_is_lost_is_lost_by_the_rule(shifts, rotation, std, missing):
     np.testing.assert_array_equal(lost, wanted)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("std", [None, 0.05])
 def test_lost_measurements_count_neither_in_d_nor_in_residuals(std):
     cal = fitted(APART, frayed(), std=std)
@@ -196,6 +200,7 @@ def most_passes(shifts):
     return 2 * whole.sweeps
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", [(1, 1), (2, 2), (3, 3), (24, 3), (4, 4)])
 def test_islands_and_strips_in_the_dark_do_no_harm(size):
     mask = np.zeros((5, *SMALL), bool)
@@ -208,6 +213,7 @@ def test_islands_and_strips_in_the_dark_do_no_harm(size):
     assert cal.findings == ()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(6))
 def test_ragged_edges_at_mostly_whole_shifts_converge(seed):
     cal = fitted(MIXED, frayed(seed))
@@ -230,6 +236,7 @@ def with_edge(edge, rng, clean, mask):
     return mask | (grown & missing)
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::equipix.errors.EquipixWarning")
 @pytest.mark.parametrize("edge", ["circle", "threshold", "frayed"])
 @pytest.mark.parametrize("std", [None, 0.3])

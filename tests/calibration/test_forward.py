@@ -98,6 +98,7 @@ def squares_of(cal, frames, variance, mask):
     return np.sum(np.square(residuals[used], dtype=np.float64)), residuals
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("masked", [None, "some"])
 @pytest.mark.parametrize("case", CASES)
 def test_residuals_are_those_that_were_minimised(case, masked):
@@ -105,6 +106,7 @@ def test_residuals_are_those_that_were_minimised(case, masked):
     assert_minimised(cal, frames, variance, mask)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", [case for case in CASES if "between" in case or case == "refined"])
 def test_residuals_without_measurements_that_are_lost_were_minimised(case):
     cal, frames, variance, mask = calibrated(case, masked="frayed")

@@ -72,6 +72,7 @@ def main_of(arguments):
 
 
 class TestDoors:
+    @pytest.mark.long
     def test_give_the_same_flags(self, doors):
         virtual, averages, files, command = doors
         np.testing.assert_array_equal(averages.flags, files.flags)
@@ -96,6 +97,7 @@ class TestDoors:
         np.testing.assert_array_equal(files.dark, command.dark)
 
 
+@pytest.mark.long
 def test_a_value_that_saturates_is_left_out_of_its_exposure_alone():
     """A pixel whose samples saturate where the beam is bright keeps the M that the others give."""
     rng = np.random.default_rng(1)
@@ -141,6 +143,7 @@ def test_saved_averages_keep_their_dark(tmp_path, suffix):
         np.testing.assert_array_equal(read.dark.maps[name], values)
 
 
+@pytest.mark.long
 def test_averages_saved_and_loaded_one_by_one_calibrate(tmp_path):
     """Each file holds the dark; equal darks are one."""
     found = statistics_of(virtual_experiment(7), 255)
@@ -171,6 +174,7 @@ def single(tmp_path_factory):
 class TestSingleFrames:
     """They show no noise: all weights are equal, and residuals determine the noise."""
 
+    @pytest.mark.long
     def test_give_the_same_from_averages_and_files(self, single):
         averages, manifest = single
         arrays = equipix.calibrate(averages, SHIFTS, uncertainty=True)
@@ -182,6 +186,7 @@ class TestSingleFrames:
         difference = np.abs(arrays.sensitivity - files.sensitivity)
         assert np.nanmax(difference / arrays.sensitivity_std) < 0.01
 
+    @pytest.mark.long
     def test_have_the_standard_deviations_of_equal_weights(self, single):
         averages, _ = single
         cal = equipix.calibrate(averages, SHIFTS, uncertainty=True)

@@ -24,6 +24,7 @@ def calibrated(response, shifts, share=0.05):
     return frames, equipix.calibrate(frames, shifts, variance=variance, uncertainty=True)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("response", [0.0, 0.01, 3.0])
 @pytest.mark.parametrize("fraction", [0.0, 0.3])
 def test_the_mean_over_usable_pixels_is_1(response, fraction):

@@ -89,6 +89,7 @@ class TestReference:
         )
         np.testing.assert_allclose(mine, theirs, atol=1e-6)
 
+    @pytest.mark.long
     @pytest.mark.parametrize("shifts", [SMALL_CROSS, FRACTIONS], ids=["whole", "between"])
     def test_two_levels_tell_gain_and_offset(self, shifts):
         twice, levels = np.tile(shifts, (2, 1)), np.repeat([1, 0.5], 5)
@@ -144,6 +145,7 @@ class TestReference:
 
 @pytest.mark.filterwarnings("ignore::equipix.errors.MisfitWarning")
 class TestBetweenPixels:
+    @pytest.mark.long
     def test_noise_counts_as_with_whole_shifts(self):
         rms = np.empty((10, 2))
         for seed in range(10):
@@ -157,6 +159,7 @@ class TestBetweenPixels:
         # Section 5 of the design: 1.21·noise/√n for smooth beams; the structure adds a little.
         assert rms[:, 1].mean() == pytest.approx(1.21 * NOISE / np.sqrt(5), rel=0.1)
 
+    @pytest.mark.long
     def test_without_noise_the_spline_itself_is_what_is_left(self):
         for seed in range(3):
             frames, shifts, truth = structured(seed, noise=0)
@@ -176,6 +179,7 @@ class TestBetweenPixels:
         rounded = equipix.calibrate(frames, np.rint(shifts), tolerance=1e-5)
         assert rms_error(rounded, truth) > 5 * NOISE
 
+    @pytest.mark.long
     def test_shifts_are_refined_where_the_beam_tells_them(self):
         rms = np.empty((4, 3))
         for seed in range(4):
@@ -198,6 +202,7 @@ class TestBetweenPixels:
         assert refined < 1.1 * true
         assert measured > 1.5 * true
 
+    @pytest.mark.long
     def test_shifts_that_a_smooth_beam_cannot_tell_stay_as_given(self):
         rng = np.random.default_rng(3)
         beam = simulate.gaussian_beam(SENSOR, width=1e4)
@@ -231,6 +236,7 @@ def drifting(seed, shape, cross, *, turn, noise=1e-3, drift=0.01, sixth=True):
 
 class TestFluxes:
     # In smooth beams free fluxes leave the orientation undetermined, which is said.
+    @pytest.mark.long
     @pytest.mark.filterwarnings("ignore:neither residuals nor fluxes determine the orientation")
     @pytest.mark.parametrize(
         ("shape", "cross", "turn"),

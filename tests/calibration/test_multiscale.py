@@ -106,11 +106,13 @@ class TestTheHardCase:
         assert cal.sweeps <= 1.2 * usual
         np.testing.assert_array_equal(cal.flags & Flag.DEAD > 0, dead)
 
+    @pytest.mark.long
     def test_the_number_of_products_does_not_depend_on_the_size(self):
         shapes = [(240, 320), (582, 782), (1164, 1564)]
         products = [equipix.calibrate(hard_case(shape)[0], HARD_CROSS).sweeps for shape in shapes]
         assert max(products) <= 1.2 * min(products)
 
+    @pytest.mark.long
     @pytest.mark.parametrize(("noise", "gaps"), [(1e-3, "dark pixels"), (1e-2, "masked")])
     @pytest.mark.filterwarnings("ignore::equipix.errors.IdentifiabilityWarning")
     def test_the_minimum_is_that_of_ten_thousand_sweeps(self, noise, gaps):

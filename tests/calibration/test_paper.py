@@ -99,6 +99,7 @@ def test_ten_times_the_noise_gives_ten_times_the_error(draw):
         assert abs(error).max() < 1e-2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("shape", "factor"), [((582, 782), 1.21), ((240, 320), 1.23)])
 def test_noise_of_the_exposures_fades_with_their_number(shape, factor):
     """The rms error is factor · noise/√n, with noise relative to the mean signal."""
@@ -158,6 +159,7 @@ def section3(monkeypatch, tmp_path):
     return section3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [1, 2])
 def test_three_experiments_agree_within_their_noise(section3, seed):
     truth, experiments = section3.prepare(seed)
@@ -168,6 +170,7 @@ def test_three_experiments_agree_within_their_noise(section3, seed):
     assert failed == []
 
 
+@pytest.mark.long
 def test_a_map_that_is_off_breaks_the_claims(section3):
     truth, experiments = section3.prepare(1)
     first, second, third = section3.calibrate_all(experiments)
@@ -183,6 +186,7 @@ def test_a_map_that_is_off_breaks_the_claims(section3):
     assert hold(one_pixel) == [True, False, True, True, True]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("light", "status"), [(1, 0), (0.25, 1)])
 def test_the_script_draws_and_says_whether_the_claims_hold(
     section3, monkeypatch, capsys, light, status

@@ -56,6 +56,7 @@ EXPERIMENTS = {
 # Of the narrow beam most of the sensor sees nothing, which is said.
 @pytest.mark.filterwarnings("ignore:the exposures determine only")
 class TestAlwaysAnAnswer:
+    @pytest.mark.long
     @pytest.mark.parametrize("name", EXPERIMENTS)
     def test_it_converges_and_errors_are_as_stated(self, name):
         shape, beam, shifts = EXPERIMENTS[name]
@@ -90,6 +91,7 @@ class TestAlwaysAnAnswer:
         # The estimate is right within a factor 10.
         assert abs(cal.sensitivity - truth / truth.mean()).max() < 10 * 1e-9
 
+    @pytest.mark.long
     def test_a_deviating_pixel_is_pulled_by_less_than_its_deviation_in_standard_deviations(self):
         shape, beam, shifts = EXPERIMENTS["laser beam"]
         found = []
@@ -124,6 +126,7 @@ class TestAlwaysAnAnswer:
         # 5 standard deviations of at most 4 %, as of others in this light.
         assert abs(error[good]).max() < 0.2
 
+    @pytest.mark.long
     @pytest.mark.filterwarnings(
         "ignore::equipix.errors.IdentifiabilityWarning",
         "ignore:no standard deviations:equipix.errors.ConvergenceWarning",
@@ -320,6 +323,7 @@ class TestTheSun:
         darkened = np.where(inside > 0, 0.4 + 0.6 * np.sqrt(np.maximum(inside, 0)), 0)
         return darkened * (1 + 0.05 * granules / 10**0.5)
 
+    @pytest.mark.long
     @pytest.mark.filterwarnings(
         "ignore:free fluxes leave a tilt", "ignore:the residuals are", "ignore:residuals of"
     )
@@ -354,6 +358,7 @@ def reference_raster():
     )
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:the exposures determine only")
 @pytest.mark.parametrize("name", ["narrow beam", "laser beam", "round vignetting", "dark corner"])
 def test_a_dark_without_noise_flags_nothing_more(name):

@@ -85,6 +85,7 @@ def test_calibrate_reports_what_it_saved(run, experiment, tmp_path):
     assert saved.metadata["options"]["tolerance"] == 1e-4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("frames", [20, 100, 500])
 def test_a_simulated_8_bit_camera_is_calibrated_without_false_pixels(run, tmp_path, frames):
     """Its noise is below a step, so that rounding is a part of it; 2175 pixels were hot."""
@@ -162,6 +163,7 @@ def test_inspect_shows_the_calibration(run, calibration):
     }  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("count", [5, 13])
 def test_shifts_are_printed_with_their_standard_deviations(run, tmp_path, count):
     rng = np.random.default_rng(1)
@@ -397,6 +399,7 @@ def test_simulate_writes_an_experiment(run, tmp_path):
     assert run(*command, "--force")[0] == 0
 
 
+@pytest.mark.long
 @pytest.mark.data
 def test_photon_transfer_gain_of_a_real_camera(run, data_dir, tmp_path):
     """K = slope of the variance over the mean; the EMVA reference gives 0.280 DN/e-."""
@@ -778,6 +781,7 @@ class TestPlan:
         assert found["findings"][0]["kind"] == "unused"
         assert found["findings"][0]["message"] in err
 
+    @pytest.mark.long
     def test_finds_patterns(self, run):
         status, out, _ = run("plan", "--shape", 64, 80, "--max-shift", 9, 9, "--drift", 0, "--json")
         assert status == 0
@@ -789,6 +793,7 @@ class TestPlan:
         assert found[0]["rms"] > six["rms"] > seven["rms"]
         assert all(each["expected_passes"] > 0 for each in (*found, six, seven))
 
+    @pytest.mark.long
     @pytest.mark.parametrize(("exposures", "more"), [(4, 2), (6, 1), (7, 0)])
     def test_says_what_more_positions_gain(self, run, exposures, more):
         command = ("plan", "--shape", 64, 80, "--exposures", exposures, "--drift", 1e-6)
@@ -800,6 +805,7 @@ class TestPlan:
         )
         assert gains == ["6", "7"][2 - more :]
 
+    @pytest.mark.long
     def test_judges_each_pattern_that_it_finds(self, run):
         status, out, err = run("plan", "--shape", 300, 400, "--max-shift", 9, 9)
         assert status == 0
@@ -820,6 +826,7 @@ class TestPlan:
         )  # fmt: skip
         assert "do not constrain a wave of (0." in err
 
+    @pytest.mark.long
     def test_a_single_row(self, run, tmp_path):
         command = ("plan", "--shape", 1, 40, "-o", tmp_path / "plan.png", "--drift", 0, "--json")
         status, out, err = run(*command, "--max-shift", 5, 5)

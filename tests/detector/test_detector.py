@@ -175,6 +175,7 @@ class TestSource:
     def test_numbers_of_the_tolerance(self, band, how, wanted):
         assert f"{spread(band, **how):.1e}" == wanted
 
+    @pytest.mark.long
     def test_the_example_prints_them_beside_those_of_the_source(self, capsys):
         path = Path(__file__).parents[2] / "examples/composition.py"
         runpy.run_path(str(path), run_name="__main__")

@@ -55,6 +55,7 @@ class TestFluxPriors:
         # 12 values of Student's t with 7 degrees of freedom: 4.8 in one of 1000 such sets.
         assert np.abs(z).max() < 4.8
 
+    @pytest.mark.long
     def test_right_ones_are_left(self):
         for seed in range(6):
             assert self.experiment(seed, 1e-3)[1] == []
@@ -117,6 +118,7 @@ class TestFalsePixels:
         frames[:, stuck] = rng.choice([0.1, 3.0], stuck.sum())
         return frames, stuck, truth
 
+    @pytest.mark.long
     @pytest.mark.parametrize("share", [0, 1e-3])
     def test_neighbours_of_constant_pixels_are_as_good_as_others(self, share):
         for seed in range(3):

@@ -154,6 +154,7 @@ def test_the_cause_is_named(cause):
         assert found.cause == cause
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cause", ["rows", "columns", "region", "shifts", "flux", "structure"])
 def test_correlated_residuals_show_without_variances(cause):
     for seed in range(3):
@@ -163,6 +164,7 @@ def test_correlated_residuals_show_without_variances(cause):
         assert "neighbouring pixels are correlated" in found.words
 
 
+@pytest.mark.long
 def test_a_false_scale_is_named_with_its_size():
     for seed in range(3):
         found = found_in(*with_a_false_scale(np.random.default_rng([3, seed])))
@@ -299,6 +301,7 @@ FIVE = np.array([(0, 0), (0, 11), (0, 29), (14.4, 0.3), (37.2, -0.2)])
 BETWEEN = np.array([(0, 0), (0.37, 0.21), (-0.28, 0.44), (0.1, 0.13), (0.2, -0.24)])
 
 
+@pytest.mark.long
 def test_noise_that_a_spline_follows_is_no_misfit():
     """Its slow waves more than its fast ones: neighbours were correlated by -5 %, 5.2 errors."""
     for seed in range(2):

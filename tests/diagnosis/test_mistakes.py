@@ -194,6 +194,7 @@ def findings(values, shifts=SHIFTS, **known):
         return equipix.calibrate(values, shifts, **known).findings
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("std", [None, 0.02], ids=["known", "prior"])
 @pytest.mark.parametrize("flux", [0.5, 2, 3])
 def test_a_flux_that_is_far_off_names_the_exposure(bench, flux, std):
@@ -219,6 +220,7 @@ def test_pixels_that_a_wrong_flux_contradicts_are_no_defects(flux):
     assert cal.reduced_chi2 > 100
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("flux", [None, "fit"])
 @pytest.mark.parametrize("black", [0, 1])
 def test_a_black_exposure_is_named(bench, flux, black):
@@ -256,6 +258,7 @@ def test_a_tilted_sensitivity_is_no_wrong_flux(bench):
     assert "flux" not in {each.kind for each in findings(values)}
 
 
+@pytest.mark.long
 def test_shifts_in_millimetres_are_named(bench):
     found = findings(arrays(bench), 0.0083 * SHIFTS)
     assert "divide millimetres by the pixel pitch" in found[0].message

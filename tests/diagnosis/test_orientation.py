@@ -64,6 +64,7 @@ def test_each_of_eight_orientations_is_found_and_named(given):
     assert found.best.words in found.words or found.sign == "confirmed"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("true", "given"), [(90, 270), (270, 90)])
 def test_an_opposite_quarter_turn_is_named(true, given):
     shifts, turns = np.vstack([CROSS, [(4, -3)]]), np.zeros(6, int)
@@ -89,6 +90,7 @@ def test_fringes_along_rows_determine_no_sign_along_columns(mirrored):
     )
 
 
+@pytest.mark.long
 def test_rows_reversed_in_fringes_are_never_confirmed():
     """With both axes in the fringes, and with one axis: no finding, or the right one."""
     for seed in range(6):
@@ -100,6 +102,7 @@ def test_rows_reversed_in_fringes_are_never_confirmed():
         assert found.rows != "confirmed"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("periods", [(3, 10), (4, 8)])
 def test_fine_speckle_contradicts_reversed_shifts(periods):
     for seed in range(2):
@@ -152,6 +155,7 @@ def with_nuisance(kind, frames, beam_of, rng):
     return frames + 0.005 * ghost
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["illumination", "ghost", "non-linear"])
 def test_nuisances_give_no_finding(kind):
     """In smooth beams: neither a right finding nor a wrong one."""
@@ -230,6 +234,7 @@ class TestOrientationsThatLeaveNoResidual:
             assert "probably wrong" in cal.orientation.words
             assert cal.shift_sign == "undetermined"
 
+    @pytest.mark.long
     def test_a_right_sign_is_never_called_wrong(self):
         for seed in range(6):
             cal, _ = self.calibrated(seed, self.TRUE)
@@ -237,6 +242,7 @@ class TestOrientationsThatLeaveNoResidual:
             assert cal.orientation.hidden is None
             assert "do not determine" in cal.orientation.words
 
+    @pytest.mark.long
     def test_a_drift_of_the_lamp_is_no_wrong_sign(self):
         for seed in range(6):
             cal, _ = self.calibrated(seed, self.TRUE, drift=10.0 ** -(1 + seed % 3))

@@ -87,6 +87,7 @@ def test_no_false_alarm_in_200_experiments_with_a_drifting_lamp(draws, figure):
     assert "confirmed" in told["striped"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("whole", [True, False])
 def test_a_structured_beam_contradicts_reversed_shifts(whole):
     for seed in range(6):
@@ -97,6 +98,7 @@ def test_a_structured_beam_contradicts_reversed_shifts(whole):
         assert sign_of(frames, shifts) == "confirmed"
 
 
+@pytest.mark.long
 def test_shifts_far_apart_ask_a_smaller_window():
     cross = equipix.cross_pattern(97, 160)
     frames, shifts = experiment(1, wavy(1), shape=(240, 320), cross=cross)

@@ -45,6 +45,7 @@ def test_suggested_patterns_are_not():
         assert micrometre_step(suggestion.shifts.astype(float), (96, 128)) is None
 
 
+@pytest.mark.long
 def test_calibrate_asks():
     shape, shifts = (200, 200), 8.3 * CROSS
     truth = simulate.paper_sensitivity(shape, rng=1)

@@ -246,6 +246,7 @@ def pillow(files):
     return [np.asarray(Image.open(file)) for file in files]
 
 
+@pytest.mark.long
 @pytest.mark.data
 def test_a_real_camera_has_the_figures_of_plain_numpy(data_dir, run):
     folder = data_dir / "emva1288-set001-ccd-12bit"
@@ -482,6 +483,7 @@ def test_photons_in_another_unit_are_named(camera, tmp_path):
     }
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::equipix.errors.InputWarning")  # few levels
 def test_memory_does_not_grow_with_frames_and_levels(tmp_path):
     peaks = []

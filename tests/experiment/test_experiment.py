@@ -129,6 +129,7 @@ def test_measured_shifts_are_the_stage_s(manifest, virtual):
     np.testing.assert_allclose(shifts, virtual.truth.shifts, atol=0.1)
 
 
+@pytest.mark.long
 def test_moves_are_measured_again_with_a_part_of_the_sensor(tmp_path, monkeypatch):
     """As well as with all of it: both leave the noise of the images."""
     truth = simulate.paper_sensitivity((400, 420), rng=1)
@@ -158,6 +159,7 @@ def test_moves_are_measured_again_with_a_part_of_the_sensor(tmp_path, monkeypatc
     assert (np.abs(shifts[0] - shifts[1]) < std[0].max() / 2).all()
 
 
+@pytest.mark.long
 def test_the_second_measurement_of_shifts_gains(tmp_path, monkeypatch):
     """Six sensors in a narrow beam; calibrated with the shifts as measured once, and twice."""
     measured = experiment_run.measured_moves

@@ -103,6 +103,7 @@ def outcome(call: Callable[[], Any]) -> Any:
         return str(error)
 
 
+@pytest.mark.long
 def test_agrees_with_the_reference() -> None:
     rng = np.random.default_rng(1)
     seen = []

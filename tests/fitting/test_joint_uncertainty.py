@@ -70,6 +70,7 @@ class TestAgainstDenseAlgebra:
         # The variance lacks 1e-4 at most of what the other unknowns bring to it.
         assert cal.std_of(weights) == pytest.approx(wanted, rel=1e-4)
 
+    @pytest.mark.long
     def test_refined_shifts(self):
         shape, std = (8, 32), np.array([0, 0.05, 0.03, 0.05, 0.05])
         rng = np.random.default_rng(3)
@@ -206,6 +207,7 @@ def in_gauge(truth, used, *, level):
     return truth / truth[used].mean()
 
 
+@pytest.mark.long
 def test_shifts_that_no_beam_tells_are_wrong_by_their_prior():
     shape, shifts, std = (24, 30), equipix.cross_pattern(4, 7).astype(float), 0.05
     rng = np.random.default_rng(49)

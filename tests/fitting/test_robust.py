@@ -55,6 +55,7 @@ def compared(frames, truth, dusty, **options):
     return robust, rms(found[pixels]) / rms(best[pixels]), rms(found) / rms(best)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("contrast", [0.02, 0.05, 0.2, 1.0])
 @pytest.mark.parametrize("seed", range(4))
 def test_a_grain_of_dust(seed, contrast):
@@ -76,6 +77,7 @@ def test_a_grain_of_dust(seed, contrast):
     assert rms(harm[0]) > 1.5 * rms(harm[1])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("variance", ["unit", "known", "half", "model"])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_clean_frame_loses_nothing(seed, variance):
@@ -97,6 +99,7 @@ def test_a_clean_frame_loses_nothing(seed, variance):
     assert cal.rejected.sum() <= 4 * 9
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("frames_as", ["arrays", "averages"])
 @pytest.mark.parametrize("seed", range(3))
 def test_shot_noise(seed, frames_as):
@@ -118,6 +121,7 @@ def test_shot_noise(seed, frames_as):
     assert on_frame <= 1.02
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_unit_weights(seed):
     rng, truth, beam = sensor(seed)
@@ -131,6 +135,7 @@ def test_unit_weights(seed):
     assert on_frame <= 1.02
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_a_reflection(seed):
     """Brighter, and larger than the arms of the cross: it meets itself in the cells of the beam."""
@@ -145,6 +150,7 @@ def test_a_reflection(seed):
     assert on_frame <= 1.02
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_dust_in_several_exposures_and_a_turned_one(seed):
     rng, truth, beam = sensor(seed)
@@ -185,6 +191,7 @@ def test_a_pixel_none_of_whose_values_agree_is_flagged(kept):
     assert cal.flags[40, 50] & Flag.UNRELIABLE_FLAT
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::equipix.errors.IdentifiabilityWarning")
 @pytest.mark.parametrize("seed", range(3))
 def test_the_search_ends_where_pixels_have_few_values(seed, monkeypatch):
@@ -213,6 +220,7 @@ def test_without_noise_nothing_is_left_out():
     assert not cal.rejected.any()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("suffix", [".tif", ".npz"])
 def test_what_was_left_out_is_saved(tmp_path, suffix):
     rng, truth, beam = sensor(7)

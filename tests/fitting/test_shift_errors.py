@@ -61,6 +61,7 @@ def test_shifts_ten_times_as_wrong_as_stated_are_noticed():
         assert kinds(calibrated("off centre", seed, times=10))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", BEAMS)
 def test_a_prior_on_fluxes_is_not_contradicted_by_shifts(name):
     for seed in range(6):
@@ -88,6 +89,7 @@ def test_the_variance_of_a_flux_is_that_of_the_slope():
         assert unrefined(cal.weighted, residuals).std.shape == (2, 5)
 
 
+@pytest.mark.long
 def test_shifts_that_were_refined_or_exact_add_nothing():
     rng = np.random.default_rng(2)
     beam = simulate.wavy_beam(SENSOR, rng=3)
@@ -98,6 +100,7 @@ def test_shifts_that_were_refined_or_exact_add_nothing():
         assert unrefined(cal.weighted, sampled(cal.weighted)) is None
 
 
+@pytest.mark.long
 def test_along_fringes_only_the_other_direction_is_left():
     def fringes(rows, cols):
         return np.exp(1e-3 * rows) * (1 + 0.1 * np.cos(2 * np.pi * cols / 30)) + 0 * rows

@@ -52,6 +52,7 @@ def rms_error(cal, truth):
 
 
 class TestFringes:
+    @pytest.mark.long
     @pytest.mark.parametrize("crossed", [False, True])
     @pytest.mark.parametrize("period", [10, 20, 40, 60, 100])
     def test_they_converge_to_the_error_of_the_true_shifts(self, period, crossed):
@@ -66,12 +67,14 @@ class TestFringes:
         # Some 225 000 degrees of freedom: five standard errors of χ² are 1.5 %.
         assert cal.reduced_chi2 == pytest.approx(1, abs=0.015)
 
+    @pytest.mark.long
     @pytest.mark.parametrize("crossed", [False, True])
     @pytest.mark.parametrize("period", [20, 40])
     def test_250_passes_are_enough(self, period, crossed):
         frames, measured, _ = experiment(fringes(period, crossed=crossed))
         assert refined(frames, measured).sweeps <= 250
 
+    @pytest.mark.long
     def test_shifts_beside_an_exact_reference_are_refined(self):
         frames, measured, _ = experiment(fringes(20))
         measured[0] = CROSS[0]
@@ -82,6 +85,7 @@ class TestFringes:
         # As without a reference.
         assert abs(cal.shifts - CROSS)[:, 1].max() < 5e-3
 
+    @pytest.mark.long
     def test_the_estimate_is_about_m(self):
         frames, measured, _ = experiment(fringes(20))
         rough = refined(frames, measured, tolerance=1e-4)
@@ -91,6 +95,7 @@ class TestFringes:
         # As elsewhere: not above three times the estimate.
         assert abs(rough.sensitivity - exact.sensitivity).max() < 3 * rough.error_estimate
 
+    @pytest.mark.long
     def test_along_oblique_fringes_shifts_stay_as_measured(self):
         frames, measured, _ = experiment(fringes(20, angle=np.pi / 6))
         cal = refined(frames, measured)
@@ -141,6 +146,7 @@ class TestErrorBars:
                 1, abs=4 * np.sqrt(1 / (2 * count))
             )
 
+    @pytest.mark.long
     def test_noise_in_the_beam_is_no_information(self):
         """Beside information I slopes have noise N, and shifts scatter by √(1 + N/I) of 1/√I.
 

@@ -167,6 +167,7 @@ class TestAgainstSimulatedExperiments:
         clean = simulate.exposures(truth, simulate.gaussian_beam(shape), shifts)
         return mean_square_scores(clean, shifts, truth, used, experiments, rng)
 
+    @pytest.mark.long
     def test_no_unbiased_estimate_could_be_better(self):
         ratios = []
         for seed in range(4):

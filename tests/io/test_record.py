@@ -425,6 +425,7 @@ def test_a_changed_byte_of_any_array_is_noticed(tmp_path, name, suffix):
             equipix.load(path)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_a_flipped_bit_of_a_file_is_refused_or_changes_nothing(tmp_path, suffix):
     path, wanted = tmp_path / f"kept{suffix}", KINDS["averages"]

@@ -159,5 +159,6 @@ class TestRealCamera:
             for each in numbers
         ]
 
+    @pytest.mark.long
     def test_all_levels_in_which_few_pixels_saturate_are_good(self, data_dir):
         assert said(self.levels(data_dir, range(0, 37, 3), 4095)) == []

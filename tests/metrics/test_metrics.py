@@ -568,6 +568,7 @@ def set_001(data_dir):
 class TestRealCamera:
     """The figures of the README of the data, release 4.0."""
 
+    @pytest.mark.long
     def test_gain_responsivity_and_linearity(self, set_001):
         dark, bright, light, _ = set_001
         found = metrics.emva_transfer(bright, dark, light)
@@ -576,6 +577,7 @@ class TestRealCamera:
         assert found.quantum_efficiency == pytest.approx(0.45249, rel=0.01)
         assert found.linearity_error == pytest.approx(0.00297, abs=0.0002)
 
+    @pytest.mark.long
     def test_non_uniformity_and_its_parts(self, set_001):
         many = set_001[3]
         found = metrics.emva_spatial(many["b"], many["d"], gain_dn_per_e=0.28006)

@@ -774,6 +774,7 @@ class TestToneLaws:
         assert (picture(np.full((2, 2), np.nan), display) == 0).all()
 
 
+@pytest.mark.long
 @pytest.mark.data
 def test_a_real_camera_from_files(data_dir, tmp_path):
     """Six of the exposure levels of a 12-bit CCD."""

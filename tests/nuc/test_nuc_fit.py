@@ -273,6 +273,7 @@ class TestOrder:
         response = nuc.fit(curves(truth(1, np.random.default_rng(1))), order="auto")
         assert response.order == 1
 
+    @pytest.mark.long
     def test_one_pixel_does_not_decide_on_the_order(self):
         errors = []
         for times in (1, 1.9, 3):

@@ -51,6 +51,7 @@ def frames(count=3):
     return np.random.default_rng(2).integers(100, 3000, (count, *SHAPE), dtype=np.uint16)
 
 
+@pytest.mark.long
 def test_the_pattern_that_noise_leaves_is_predicted():
     """Order 2 leaves an InSb array noise alone; order 1 leaves its curvature, too."""
     count, squares, predicted = 32, [], []
@@ -342,10 +343,12 @@ def levels(data_dir):
 
 @pytest.mark.data
 class TestRealCamera:
+    @pytest.mark.long
     def test_levels_that_saturate_are_refused(self, levels):
         with pytest.raises(errors.InputError, match=r"level 30: 100.0% .* 4095 DN"):
             nuc.fit(levels[:30] + levels[39:40])
 
+    @pytest.mark.long
     def test_two_points_explain_a_ccd_and_the_order_is_found(self, levels):
         free = [each for each in levels if np.mean(each.saturated > 0) < 0.01]
         assert len(free) == 37
@@ -363,6 +366,7 @@ class TestRealCamera:
         spread = np.sqrt(np.var(gain) - np.mean(response.variances[1][good]))
         assert spread == pytest.approx(0.00433, rel=0.05)
 
+    @pytest.mark.long
     def test_levels_left_out_are_corrected_and_higher_orders_add_noise(self, levels, data_dir):
         free = [k for k, each in enumerate(levels) if np.mean(each.saturated > 0) < 0.01]
         held = [free[9], free[18], free[27]]

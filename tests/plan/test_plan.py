@@ -242,6 +242,7 @@ class TestNoise:
         bright = budget_of(shape, CROSS, noise=1e-3, flux=[2] * 5).rms
         assert bright == pytest.approx(once / 2, rel=1e-2)
 
+    @pytest.mark.long
     def test_known_fluxes_weigh(self):
         shape, sigma, flux = (64, 80), 1e-3, np.array([1, 2, 0.5, 1.5, 0.7])
         shifts = equipix.cross_pattern(5, 7)
@@ -461,6 +462,7 @@ class TestSuggest:
         for suggestion in found:
             assert products(shape, suggestion.shifts) <= 4 * products(shape, CROSS)
 
+    @pytest.mark.long
     def test_the_same_seed_finds_the_same(self):
         first, second = (
             plan.suggest((64, 80), 5, (10, 20), drift=1e-6, rng=4)[0].shifts for _ in range(2)
@@ -471,6 +473,7 @@ class TestSuggest:
         told = distinct_trend(first)
         assert told == pytest.approx(distinct_trend(first[plan.advise_order(first)]), abs=1e-9)
 
+    @pytest.mark.long
     def test_five_unless_told(self):
         found = plan.suggest((40, 50), None, 12, drift=0)[0].shifts
         assert len(found) == 5
@@ -478,6 +481,7 @@ class TestSuggest:
         # Fewer where the travel has fewer positions.
         assert len(plan.suggest((1, 50), None, (0, 2), drift=0)[0].shifts) == 3
 
+    @pytest.mark.long
     def test_not_all_at_the_corners(self):
         """Distances differ, and no wave of the travel's period is left with little weight."""
         travel = 30
@@ -491,6 +495,7 @@ class TestSuggest:
             assert visible.min() > 0.5
             assert plan.identify((96, 128), shifts).components == 1
 
+    @pytest.mark.long
     def test_tells_its_progress(self):
         told = []
         plan.suggest((40, 50), 4, 9, drift=0, progress=lambda *each: told.append(each))
@@ -499,6 +504,7 @@ class TestSuggest:
             assert steps == sorted(steps)
             assert steps[-1][0] == steps[-1][1]
 
+    @pytest.mark.long
     def test_says_that_drift_will_tilt(self):
         with pytest.warns(MisfitWarning, match="drift"):
             plan.suggest((64, 80), 4, 5, drift=1e-3, patterns=1)

@@ -67,6 +67,7 @@ def shown(browser, address, size, scheme="light"):
     context.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", [WIDE, PHONE])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_axe_finds_nothing_serious(browser, address, size, scheme):
@@ -83,6 +84,7 @@ def test_a_phone_does_not_scroll_sideways(browser, address):
         assert tab.evaluate("document.documentElement.scrollWidth") == PHONE[0]
 
 
+@pytest.mark.long
 def test_a_map_tells_the_value_under_the_pointer(browser, address):
     sensitivity = calibration().sensitivity
     with shown(browser, address, WIDE) as tab:
@@ -112,6 +114,7 @@ def test_arrow_keys_move_over_a_map(browser, address):
         assert others == [(row + 1, col), (row + 1, col - 10)]
 
 
+@pytest.mark.long
 def test_reduced_maps_tell_the_pixels_of_a_block(browser, tmp_path):
     """Those of the last row and column are fewer."""
     values = np.arange(5.0 * 7).reshape(5, 7)
@@ -130,6 +133,7 @@ def test_reduced_maps_tell_the_pixels_of_a_block(browser, tmp_path):
             assert told.inner_text() == words
 
 
+@pytest.mark.long
 def test_print_opens_what_is_closed(browser, address):
     with shown(browser, address, WIDE) as tab:
         tab.evaluate("document.querySelectorAll('details').forEach((each) => each.open = false)")

@@ -88,6 +88,7 @@ class Checked(HTMLParser):
         assert self.open.pop() == tag
 
 
+@pytest.mark.long
 def test_each_kind_of_result_has_a_part(results):
     parts = [part_of(name, each, NOTHING, share=4) for name, each in results.items()]
     text = page(parts, "All")
@@ -110,6 +111,7 @@ def test_a_long_table_is_folded_and_printed(results):
     assert re.search(r'"beforeprint", .*"details"\)\) each\.open = true', text)
 
 
+@pytest.mark.long
 def test_findings_stand_in_the_page_as_text(results):
     text = page([part_of("cal", results["calibration"], NOTHING)], "One")
     assert "the lamp drifts by <2 %" not in text
@@ -231,6 +233,7 @@ def test_blocks_of_colour_filters_leave_no_moire():
     assert np.ptp(Map("it", "", values).reduced(50)[0]) == 0
 
 
+@pytest.mark.long
 def test_errors_of_m_count_the_drift_once(results):
     """Error bars contain the tilt that a drift hides; the solver's estimate is none of them."""
     cal, shape = results["calibration"], np.array(SHAPE)
@@ -297,6 +300,7 @@ def test_dead_and_hot_pixels_are_listed_before_those_of_a_mask(results):
     assert table.caption == "dead 1, hot 1, no flat field 384. 200 of 386 are listed."
 
 
+@pytest.mark.long
 def test_shifts_and_fluxes_are_listed(results):
     cal = results["calibration"]
     table = part_of("it", cal, NOTHING).tables[0]
@@ -375,6 +379,7 @@ def test_curves_have_names_units_and_signs(results):
 
 
 class TestLimits:
+    @pytest.mark.long
     def test_the_template_is_read_and_judges(self, tmp_path, results):
         path = tmp_path / "limits.toml"
         path.write_text(limits_template())
@@ -386,6 +391,7 @@ class TestLimits:
             *("error_estimate", "converged"),
         }
 
+    @pytest.mark.long
     @pytest.mark.parametrize(
         ("text", "passed"),
         [
@@ -408,6 +414,7 @@ class TestLimits:
         assert [check.passed for check in part.checks] == [passed]
         assert part.verdict == ("PASS" if passed else "FAIL")
 
+    @pytest.mark.long
     def test_a_figure_that_is_not_known_fails(self, tmp_path):
         """Not one that a result cannot have, such as a misfit without degrees of freedom."""
         path = tmp_path / "limits.toml"
@@ -518,6 +525,7 @@ class TestCommand:
         assert len(text) < 15e6
         assert re.search(r"<h3>Provenance</h3>", text)
 
+    @pytest.mark.long
     def test_ends_with_1_beyond_a_limit_if_asked_to(self, saved, tmp_path, run):
         limits, out = tmp_path / "limits.toml", tmp_path / "report.html"
         status, _, _ = run("init", "limits", tmp_path)
@@ -551,6 +559,7 @@ class TestCommand:
         assert run("report", name, "-o", tmp_path / "it.html", "--json")[0] == 0
         assert "?.tif</h2>" in (tmp_path / "it.html").read_text(encoding="utf-8")
 
+    @pytest.mark.long
     def test_too_large_a_page_is_refused(self, saved, tmp_path, run, monkeypatch):
         monkeypatch.setattr("equipix.report.page._MOST_BYTES", 100_000)
         status, _, told = run("report", saved, "-o", tmp_path / "it.html")
@@ -581,6 +590,7 @@ class TestCommand:
         assert not [*tmp_path.iterdir()]
 
 
+@pytest.mark.long
 def test_a_picture_of_each_kind(results, tmp_path):
     for name, each in results.items():
         figure = each.plot()
@@ -589,6 +599,7 @@ def test_a_picture_of_each_kind(results, tmp_path):
     each.plot().savefig(tmp_path / "it.png", dpi=30)
 
 
+@pytest.mark.long
 def test_inspect_draws(saved, tmp_path, run):
     out = tmp_path / "cal.png"
     assert run("inspect", saved, "-o", out)[0] == 0
@@ -611,6 +622,7 @@ def test_notebooks_without_the_libraries_show_words(results, monkeypatch):
 
 
 class TestCamera:
+    @pytest.mark.long
     def test_writes_a_page_of_all_figures(self, tmp_path, run):
         out = tmp_path / "camera.html"
         status, printed, told = run("emva", written_camera(tmp_path), "-o", out)
@@ -691,6 +703,7 @@ class TestCamera:
         assert run(*asked)[0] == 0
         assert len(judged) == 1
 
+    @pytest.mark.long
     def test_planes_are_parts_and_columns(self, tmp_path, run):
         path, out = written_camera(tmp_path, cfa="RGGB", count=18, spatial=0), tmp_path / "it.html"
         status, printed, told = run("emva", path, "-o", out)
@@ -753,6 +766,7 @@ def public_classes():
     }
 
 
+@pytest.mark.long
 def test_short_forms_are_a_line(results, tmp_path):
     """Of each public class, and of what public functions give."""
     cal, response, raw = results["calibration"], results["response"], measured(1500)

@@ -58,6 +58,7 @@ def run():
 class TestStandardScene:
     """The figures that hold on the standard scene; docs/scene.py prints them for three seeds."""
 
+    @pytest.mark.long
     @pytest.mark.parametrize(
         ("name", "fall"),
         [
@@ -99,6 +100,7 @@ REQUIRED = {
 """Falls of the pattern after 500 and 2000 moving frames, and of the gain error after 2000."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("seed", "count"), [(1, 2000), (2, 500), (3, 500)])
 def test_the_falls_on_a_part_of_the_standard_scene(seed, count):
     """Of 96x96 pixels, for time; ``python docs/scene.py --check`` has all, of three seeds."""
@@ -398,6 +400,7 @@ def test_an_even_pan_never_lets_a_pattern_grow(move):
     assert size[-1] < size[1001] < size[101] < size[1]
 
 
+@pytest.mark.long
 def test_an_even_pan_leaves_the_fall():
     moving = MovingScene(seed=1, shape=(64, 64))
     noise = np.random.default_rng(8)
@@ -487,6 +490,7 @@ def test_a_lasting_change_of_the_frames_is_taken_in_the_end(settled):
     assert method.frames > before
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 def test_saturated_pixels_are_not_learned_from(name):
     """At a limit that 15 % of the values reach, the gains stay better than none at all.

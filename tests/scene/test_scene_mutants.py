@@ -96,6 +96,7 @@ def test_registered_meets_what_its_mutants_fail(moving, frames):
     assert gains >= GAIN_FALL
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mutant", [WrongSign, WrongMotion, WholePixels, FullBand])
 def test_the_pattern_tells(moving, frames, mutant):
     with np.errstate(all="ignore"):
@@ -103,6 +104,7 @@ def test_the_pattern_tells(moving, frames, mutant):
     assert not pattern >= FALL
 
 
+@pytest.mark.long
 def test_the_gain_error_tells_a_frozen_gain(moving, frames):
     for method, mutant in ((None, FrozenGain), (Kalman, FrozenKalman)):
         if method is not None:

@@ -70,6 +70,7 @@ def test_no_method_diverges_in_twenty_thousand_frames(contrast, noise, figure, p
         assert 1 / pattern[-1] >= least, name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["local-mean", "gated", "registered"])
 def test_gains_of_edges_are_as_good_as_those_of_the_middle(name):
     moving = MovingScene(seed=1, shape=SHAPE, noise=0.1)
@@ -148,6 +149,7 @@ def test_registered_learns_nothing_from_still_or_unrelated_frames(unmoved):
         assert method.frames <= 8, kind
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 def test_the_standard_scene_has_no_finding(name):
     for seed in range(20):

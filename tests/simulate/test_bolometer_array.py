@@ -161,6 +161,7 @@ def test_pulses_add_up_in_pixels_that_are_slow(conductance):
     assert many == pytest.approx(wanted, rel=0.02)
 
 
+@pytest.mark.long
 def test_a_pixel_without_a_steady_state_is_refused():
     array = BolometerArray(shape=(1, 1), capacity_j_per_k=1.0)
     with pytest.raises(errors.InputError, match="reaches no steady state"):

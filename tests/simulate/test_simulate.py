@@ -202,6 +202,7 @@ class TestNoisePrediction:
         gauge = np.eye(pixels) - share
         return np.sqrt(np.trace(gauge @ covariance @ gauge.T) / pixels)
 
+    @pytest.mark.long
     def test_is_what_a_solver_leaves(self):
         self.set_up((18, 33))
         rng = np.random.default_rng(5)
@@ -463,6 +464,7 @@ class TestWrite:
         with pytest.raises(InputError, match="'folder' holds .*, expected a path"):
             small_experiment().write(folder)
 
+    @pytest.mark.long
     def test_memory_does_not_grow_with_the_number_of_frames(self, tmp_path):
         def peak(frames):
             tracemalloc.start()
