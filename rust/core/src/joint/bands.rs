@@ -29,7 +29,12 @@ pub(crate) struct Strip {
 
 impl Bands {
     /// Bands of `fewest` rows of a sensor at least: a band adds to as many rows of cells and those that shifts reach.
-    pub(crate) fn new(windows: &[Window], geometry: &Geometry, width: usize, fewest: usize) -> Self {
+    pub(crate) fn new(
+        windows: &[Window],
+        geometry: &Geometry,
+        width: usize,
+        fewest: usize,
+    ) -> Self {
         let views = &geometry.views;
         let reach = |view: usize| {
             let rows = windows.iter().filter(|window| window.view == view).map(|window| window.row);

@@ -7,10 +7,10 @@
 //! S x = w₀ Bᵀ c b M² (v − l α),   v = c B x,   α = i Σ b l v,   i = w₀ l₀²/Σ w e²,   δM = −M α
 //! ```
 //!
-//! with sums over the exposures of a pixel. Weights that are the same in an exposure are kept in its taps, as √b c. Taps along rows and along columns are applied one after the other. A band
-//! of pixels keeps the last rows of cells as seen along a row, of x and of a, and the last rows of pulls. M, Σ w e²
-//! and the right-hand side are found in double precision at each step, which makes good what the one before left by
-//! rounding (iterative refinement).
+//! with sums over the exposures of a pixel. Weights that are the same in each exposure are kept in its taps, as √b c.
+//! Taps along rows and along columns are applied one after the other. A band of pixels keeps the last rows of cells as
+//! seen along a row, of x and of a, and the last rows of pulls. M, Σ w e² and the right-hand side are found in double
+//! precision at each step, which makes good what the one before left by rounding (iterative refinement).
 
 use super::bands::Bands;
 use super::fused_kernel::{Along, Back, Block, Eliminate, Ring, Subtract, Sum};
@@ -159,7 +159,7 @@ impl Fused {
                 index,
                 taps: &self.taps[0],
                 weights: &weights,
-                shares: 1.0 / self.weight,
+                per_weight: 1.0 / self.weight,
                 row: Row::of(row, cols),
                 unit: self.weight * self.light * self.light,
                 share,

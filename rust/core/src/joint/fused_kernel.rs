@@ -91,9 +91,9 @@ pub(super) struct Eliminate<'s> {
     pub(super) index: usize,
     /// Taps along rows of each exposure.
     pub(super) taps: &'s [[f32; TAPS]],
-    /// w of each measurement and 1/w₀; empty where b is the same for an exposure and in its taps.
+    /// w of each measurement, empty where b is in the taps of an exposure; 1/w₀.
     pub(super) weights: &'s [f64],
-    pub(super) shares: f64,
+    pub(super) per_weight: f64,
     /// M, its normal matrix and its last change.
     pub(super) row: Row<'s>,
     /// i times Σ w e².
@@ -109,7 +109,7 @@ impl pulp::NullaryFnOnce for Eliminate<'_> {
 
     #[inline(always)]
     fn call(self) -> f64 {
-        let Self { seen, index, taps, weights, shares, row, unit, share, block, pulls } = self;
+        let Self { seen, index, taps, weights, per_weight, row, unit, share, block, pulls } = self;
         let width = seen[0].width;
         let is_uneven = !weights.is_empty();
         let Block { seen: found, pixels: [along, m, square] } = block;
@@ -129,7 +129,7 @@ impl pulp::NullaryFnOnce for Eliminate<'_> {
                 if is_uneven {
                     let weights = &weights[k * width + first..][..cols];
                     for ((b, w), (sum, (level, value))) in even.iter_mut().zip(weights).zip(both) {
-                        *b = (shares * w) as f32;
+                        *b = (per_weight * w) as f32;
                         *sum += *b * level * value;
                     }
                 } else {

@@ -103,7 +103,10 @@ impl Penalty {
         let share = self.tau * energy / norm;
         workers.map_blocks(slope, size, |band, slope| {
             let cells = weights[band * size..].iter().zip(&beam[band * size..]);
-            slope.iter_mut().zip(cells).for_each(|(slope, (&d, a))| *slope += share * f64::from(d) * a);
+            slope
+                .iter_mut()
+                .zip(cells)
+                .for_each(|(slope, (&d, a))| *slope += share * f64::from(d) * a);
         });
         self.tau * energy
     }
@@ -294,8 +297,7 @@ mod tests {
         let seen = |rows: usize| -> Vec<f32> {
             (0..99).map(|cell| f32::from(u8::from(cell / 11 < rows))).collect()
         };
-        let of =
-            |rows| Penalty::new(shape, &seen(rows), [1.0; 2], &workers, &Control::default());
+        let of = |rows| Penalty::new(shape, &seen(rows), [1.0; 2], &workers, &Control::default());
         let (eight, nine) = (of(8), of(9));
         let (first_of_row_9, mut less, mut more) = (8 * 11, of(8), of(9));
         assert!(!eight.concerns(first_of_row_9) && nine.concerns(first_of_row_9));
@@ -313,7 +315,8 @@ mod tests {
         let mut weights = vec![1.0; 99];
         weights[0] = 0.0;
         let workers = Workers::new(None).unwrap();
-        let mut penalty = Penalty::new(shape, &weights, [1.0, LIGHT], &workers, &Control::default());
+        let mut penalty =
+            Penalty::new(shape, &weights, [1.0, LIGHT], &workers, &Control::default());
         let (norm, scale) = scale(&beam, &weights);
         penalty.turn_to(&beam, (&weights, norm), &mut [0.0; 99], &workers);
         let product = |x: &[f64]| {

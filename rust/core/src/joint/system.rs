@@ -536,7 +536,8 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
             // τ stays until it is asked for anew, or F would not be one function.
             let tau = self.penalty.as_ref().map_or(SMOOTHING * typical, |penalty| penalty.tau);
             let shape = self.pass.grid.geometry.beam;
-            let mut penalty = Penalty::new(shape, &self.weights, [tau, light], self.pass.workers, control);
+            let mut penalty =
+                Penalty::new(shape, &self.weights, [tau, light], self.pass.workers, control);
             // Nor would it be one if cells left it that come out of sight.
             let last = self.penalty.take();
             self.sees_more = last.is_some_and(|last| penalty.count_where(&last));

@@ -211,8 +211,7 @@ fn the_preconditioner_is_symmetric_and_the_same_in_single_precision() {
         preconditioner.apply(system, &short, &mut single, &control).unwrap();
         let pairs = single.iter().zip(&of_r).zip(&system.weights);
         let square = |off: f64, d: f32| system.ordinary[1] * f64::from(d) * off * off;
-        let off: f64 =
-            pairs.map(|((one, z), d)| square(step * f64::from(*one) - z, *d)).sum();
+        let off: f64 = pairs.map(|((one, z), d)| square(step * f64::from(*one) - z, *d)).sum();
         assert!(off.sqrt() < rounding * dot(&r, &of_r).sqrt(), "{}", off.sqrt());
     });
 }

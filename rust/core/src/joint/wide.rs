@@ -164,7 +164,8 @@ impl pulp::NullaryFnOnce for Slopes<'_> {
         for (down, ((above, own), below)) in down.iter_mut().zip(above.iter().zip(own).zip(below)) {
             *down = third(*above, *own, *below);
         }
-        let [Some(before), Some(middle), Some(after)] = [0, 1, 2].map(|from| own.get(from..)) else {
+        let [Some(before), Some(middle), Some(after)] = [0, 1, 2].map(|from| own.get(from..))
+        else {
             return;
         };
         let inner = along.iter_mut().skip(1).zip(before.iter().zip(middle).zip(after));
