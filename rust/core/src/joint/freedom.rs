@@ -49,14 +49,19 @@ pub(super) fn wave_means(
     count: usize,
     mut add: impl FnMut(&Wave, &mut [f64]),
 ) -> Vec<f64> {
+    // Not at q = 0 itself, where both symbols are 0.
+    let vector = |i: usize| TAU * (i as f64 + 0.5) / WAVES as f64;
+    let along = |symbol: fn(&Window, f64) -> Complex| -> Vec<Vec<Complex>> {
+        (0..WAVES).map(|i| windows.iter().map(|w| symbol(w, vector(i))).collect()).collect()
+    };
+    let down = along(|window, q| symbol(&window.along_rows.values, window.row, q));
+    let right = along(|window, q| symbol(&window.along_cols.values, window.col, q));
     let mut sums = vec![0.0; count];
     for wave in 0..WAVES * WAVES {
-        // Not at q = 0 itself, where both symbols are 0.
-        let q = [wave / WAVES, wave % WAVES].map(|i| TAU * (i as f64 + 0.5) / WAVES as f64);
-        let factor = |window: &Window| {
-            factor(window, [window.along_rows.values, window.along_cols.values], q)
-        };
-        let factors: Vec<Complex> = windows.iter().map(factor).collect();
+        let [row, col] = [wave / WAVES, wave % WAVES];
+        let q = [row, col].map(vector);
+        let factors: Vec<Complex> =
+            down[row].iter().zip(&right[col]).map(|(down, right)| times(*down, *right)).collect();
         let mut seen = 0.0;
         let mut mean = [0.0; 2];
         for (h, share) in factors.iter().zip(shares) {
