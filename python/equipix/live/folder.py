@@ -63,6 +63,7 @@ class WatchedFolder:
     _manifest: Manifest | None = None
     _state: _State | None = None
     _running: Running | None = None
+    _begun: int = 0
     _wanted: tuple[tuple[int, ...], np.dtype[Any]] | None = None
     _taken: dict[Path, _State] = field(default_factory=dict)
     _shapes: dict[Path, tuple[tuple[int, ...], np.dtype[Any]]] = field(default_factory=dict)
@@ -112,7 +113,7 @@ class WatchedFolder:
         """
         self._read_manifest()
         files, waiting, found = self._files(), False, list[Finding]()
-        new = self._forget_changed(files)
+        new, begun = self._forget_changed(files), self._begun
         for file, (position, state) in files.items():
             if state in (self._taken.get(file), self._refused.get(file)):
                 continue
@@ -130,6 +131,9 @@ class WatchedFolder:
                 if not 0 <= age < _GIVEN_UP:
                     self._refused[file] = state
                     found += self._finding(file, str(error))
+        if self._begun > begun:  # the first file was the odd one, and others were refused
+            self._reported.clear()
+            return self.look()
         return new, waiting, found
 
     def _take(
@@ -138,8 +142,9 @@ class WatchedFolder:
         """Add the frames of a file; refuse them if most files have another format."""
         self._shapes[file] = kind = stacks[0].shape[1:], stacks[0].dtype
         wanted = Counter(self._shapes.values()).most_common(1)[0][0]
-        if self._running is not None and self._wanted != wanted:  # the first file was the odd one
+        if self._running is not None and self._wanted != wanted:
             self._forget()
+            self._begun += 1
         if kind != wanted:
             raise FileError(
                 f"{file}: holds {kind[1]} frames of shape {kind[0]}, expected {wanted[1]} of shape "
