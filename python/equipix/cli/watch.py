@@ -42,7 +42,7 @@ def watch(
         typer.Option("--json", help="Print one JSON object a line; an error too, on stderr."),
     ] = False,
 ) -> None:
-    """Show what is determined after each new position, and which position helps most."""
+    """Show what frames determine while the camera writes them."""
     if until is not None:
         positive("until", until)
     watched = WatchedFolder(folder, experiment or folder / "experiment.toml", workers)

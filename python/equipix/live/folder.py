@@ -132,6 +132,7 @@ class WatchedFolder:
                     self._refused[file] = state
                     found += self._finding(file, str(error))
         if self._begun > begun:  # the first file was the odd one, and others were refused
+            self._refused.clear()
             self._reported.clear()
             return self.look()
         return new, waiting, found
