@@ -258,21 +258,18 @@ def test_too_few_positions_are_named() -> None:
 
 
 @pytest.mark.timing
-def test_times_at_582_by_782() -> None:
+def test_adding_and_advising_at_582_by_782() -> None:
     shape, shifts = (582, 782), np.array([(0, 0), (0, 11), (0, 19), (11, 0), (19, 0), (40, 33)])
     dark, frames = frames_of(shape, shifts)
     running = running_of(dark, frames[:5], shifts[:5])
     running.estimate()
-    seconds = {"add": [], "estimate": [], "needed": []}
+    seconds = []
     for frame in frames[5]:
         started = time.perf_counter()
         running.add(frame, shifts[5])
-        seconds["add"].append(time.perf_counter() - started)
-    for name in ("estimate", "needed"):
-        started = time.perf_counter()
-        getattr(running, name)()
-        seconds[name].append(time.perf_counter() - started)
-    print({name: max(each) for name, each in seconds.items()})
-    assert max(seconds["add"]) < 0.04
-    assert max(seconds["estimate"]) < 1
-    assert max(seconds["needed"]) < 5
+        seconds.append(time.perf_counter() - started)
+    assert max(seconds) < 0.04
+    running.estimate()
+    started = time.perf_counter()
+    running.needed()
+    assert time.perf_counter() - started < 5
