@@ -162,16 +162,17 @@ class Running:
 
     Examples
     --------
+    >>> import numpy as np
     >>> import equipix
     >>> shape, shifts = (48, 64), equipix.cross_pattern(5, 7)
     >>> beam = equipix.simulate.gaussian_beam(shape)
     >>> truth = equipix.simulate.paper_sensitivity(shape, rng=1)
     >>> light = 2e4 * equipix.simulate.exposures(truth, beam, shifts)
-    >>> camera = equipix.simulate.Camera(shape, rng=2)
+    >>> rng = np.random.default_rng(2)
     >>> running = equipix.Running(shape)
     >>> for shift, each in zip(shifts, light):
-    ...     for frame in camera.frames(each, 2):
-    ...         running.add(frame, shift)
+    ...     for _ in range(2):
+    ...         running.add(rng.poisson(each).astype(np.uint16), shift)
     >>> estimate = running.estimate()
     >>> estimate.components, estimate.determined
     (1, 1.0)
