@@ -18,6 +18,7 @@ _HOMES = {
     "LevelExperiment": "experiment.level_experiment",
     "NoiseModel": "measured.noise",
     "Polynomial": "correction.polynomial",
+    "Running": "live.running",
     "__version__": "_native",
     "average": "measured.average",
     "bolometer": "",

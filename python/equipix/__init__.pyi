@@ -23,6 +23,7 @@ from equipix.exposures.spots import cross_pattern as cross_pattern
 from equipix.exposures.spots import measure_shift as measure_shift
 from equipix.findings import Finding as Finding
 from equipix.findings import Flag as Flag
+from equipix.live.running import Running as Running
 from equipix.measured.average import average as average
 from equipix.measured.noise import NoiseModel as NoiseModel
 from equipix.measured.statistics import FrameStatistics as FrameStatistics

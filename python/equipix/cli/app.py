@@ -25,6 +25,7 @@ CALLED: ContextVar[Any] = ContextVar("CALLED", default=None)
 
 COMMANDS = {
     "calibrate": ("calibrate", "Calibrate a sensor from the images of an experiment."),
+    "watch": ("watch", "Show what frames determine while the camera writes them."),
     "inspect": ("calibrate", "Show main figures of a result, and draw its maps."),
     "compare": ("calibrate", "Show how far calibrations of one sensor agree."),
     "report": ("report", "Write results as one page, judged by limits."),

@@ -206,23 +206,10 @@ class Described(Brief, Generic[_Manifest]):
         refuse_other_types(self.path, self.manifest)
         count = len(self.manifest.measurements)
         given = None if mask is None else as_mask(mask, (count, *shape))
-        excluded = union(given, self._excluded(shape))
+        excluded = union(given, excluded_pixels(self.path, self.manifest, shape))
         hashes = sha256_of([self.path, *self.files()])
         refuse_repeats(self.path, self.manifest, hashes)
         return excluded, hashes
-
-    def _excluded(self, shape: tuple[int, int]) -> Bools | None:
-        """Pixels that ``[sensor]`` excludes; None without a mask and regions."""
-        sensor = self.manifest.sensor
-        masks = []
-        if sensor.mask is not None:
-            masks.append(_of_file(self._entry(sensor.mask)[0], shape))
-        for index, region in enumerate(sensor.region or [], start=1):
-            masks.append(region.pixels(f"{self.path}: [[sensor.region]] {index}", shape))
-        excluded = union(*masks)
-        if excluded is not None and excluded.all():
-            raise FileError(f"{self.path}: 'mask' and 'region' in [sensor] leave no pixel to use")
-        return excluded
 
     def _provenance(
         self, hashes: Mapping[Path, str], averaged: Averaged | None, **more: object
@@ -238,6 +225,22 @@ class Described(Brief, Generic[_Manifest]):
             "dark_settings": settings_in({} if dark is None else dark.metadata)._asdict(),
             "inputs": {os.path.relpath(file, folder): digest for file, digest in hashes.items()},
         }
+
+
+def excluded_pixels(
+    path: Path, manifest: Manifest | LevelManifest | CameraManifest, shape: tuple[int, int]
+) -> Bools | None:
+    """Pixels that ``[sensor]`` of the manifest `path` excludes; None without a mask and regions."""
+    sensor = manifest.sensor
+    masks = []
+    if sensor.mask is not None:
+        masks.append(_of_file(entry_files(path, sensor.mask, manifest.layout)[0], shape))
+    for index, region in enumerate(sensor.region or [], start=1):
+        masks.append(region.pixels(f"{path}: [[sensor.region]] {index}", shape))
+    excluded = union(*masks)
+    if excluded is not None and excluded.all():
+        raise FileError(f"{path}: 'mask' and 'region' in [sensor] leave no pixel to use")
+    return excluded
 
 
 def _of_file(file: Path, shape: tuple[int, int]) -> Bools:

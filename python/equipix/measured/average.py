@@ -34,7 +34,7 @@ from equipix.io.frames import (
 from equipix.io.record import made, now, read_record
 from equipix.measured.saturation import level_of
 from equipix.measured.settings import furthest, taken_with
-from equipix.measured.statistics import FrameStatistics, _masked, _step, _subtract, is_average
+from equipix.measured.statistics import FrameStatistics, _masked, _step, is_average, subtracted
 from equipix.measured.stream import Rejection, batches, sum_dtype, unmasked
 
 
@@ -144,7 +144,7 @@ def average(
         options = {"saturation": how.level, "reject": statistics.reject}
         # A saved average brings its own.
         metadata = statistics.metadata or made(options=options, started=started, **common)
-        found = dataclasses.replace(_subtract(statistics, offset), metadata=metadata)
+        found = dataclasses.replace(subtracted(statistics, offset), metadata=metadata)
         shape, level, less = found.mean.shape, found.saturation, "no" if dark is None else "its"
         text = "averaged %d frames of %d × %d pixels, saturation level %s, %s dark subtracted"
         LOG.info(text, found.count.max(), *shape, level, less)
@@ -257,19 +257,57 @@ def _statistics(
     )
 
 
+class RunningAverage:
+    """Sums over frames of one shape and dtype, which do not grow with their number.
+
+    Parameters
+    ----------
+    first : ndarray
+        A frame or several, as all that follow.
+    level : float, optional
+        Saturation level in DN; by default the largest value of an integer dtype.
+    mask : array_like of bool, shape (rows, cols), optional
+        True = do not use.
+    workers : int, optional
+        Number of threads.
+    rejection : Rejection, optional
+        How samples were left out of the frames before they were added.
+    """
+
+    def __init__(
+        self,
+        first: Array,
+        level: float | None = None,
+        mask: ArrayLike | None = None,
+        workers: int | None = None,
+        rejection: Rejection | None = None,
+    ) -> None:
+        self._given, self._rejection = first.dtype, rejection
+        self._level = level_of(first.dtype, level)
+        self._dtype = sum_dtype(first) if rejection is None else np.dtype(np.float64)
+        shape = first.shape[-2:]
+        excluded = as_mask(mask, shape)
+        self._sums = _native.Accumulator(self._dtype.name, shape, self._level, excluded, workers)
+        self.count = 0
+
+    def add(self, frames: Array) -> None:
+        """Add frames, shape (n, rows, cols)."""
+        self._sums.add(unmasked(frames, self._dtype))
+        self.count += len(frames)
+
+    def statistics(self) -> FrameStatistics:
+        """Mean and scatter of all frames so far, no dark subtracted."""
+        return _statistics(self._sums.finish(), self._given, self._level, self._rejection)
+
+
 def _average_batches(given: Iterator[Array], how: _How, total: int) -> FrameStatistics:
     first = next(given)
-    dtype, level = sum_dtype(first), level_of(first.dtype, how.level)
     everything: Iterator[Array] = itertools.chain([first], given)
     if how.rejection is not None:
-        whole = first.dtype.kind in "bui"
-        dtype, everything = np.dtype(np.float64), how.rejection.cleaned(everything, whole=whole)
-    mask = as_mask(how.mask, first.shape[1:])
-    sums = _native.Accumulator(dtype.name, first.shape[1:], level, mask, how.workers)
-    done = 0
+        everything = how.rejection.cleaned(everything, whole=first.dtype.kind in "bui")
+    sums = RunningAverage(first, how.level, how.mask, how.workers, how.rejection)
     for batch in everything:
-        sums.add(unmasked(batch, dtype))
-        done += len(batch)
+        sums.add(batch)
         if how.progress is not None:
-            how.progress(done, max(done, total), "average")
-    return _statistics(sums.finish(), first.dtype, level, how.rejection)
+            how.progress(sums.count, max(sums.count, total), "average")
+    return sums.statistics()

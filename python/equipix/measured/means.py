@@ -171,6 +171,25 @@ class Averaged:
         self.light.append(light_of(frames))
         self._points.append(_points(frames, frames.mean, free, self.light[-1], self._period))
 
+    def with_room(self, count: int) -> Self:
+        """Return a copy with room for `count` exposures, those of this one among them."""
+        grown = copy.copy(self)
+        for known in ("noise", "filters", "_dark_points", "_beside_least"):
+            vars(grown).pop(known, None)
+        grown.count = count
+        for name, kept in vars(self).items():
+            if isinstance(kept, list):
+                setattr(grown, name, [*kept])
+        added = len(self.frames)
+        for name in ("values", "variances"):
+            held: Array = getattr(self, name)
+            stack = np.empty((count, *held.shape[1:]), held.dtype)
+            stack[:added] = held[:added]
+            setattr(grown, name, stack)
+        for name in ("saturated", "always_saturated", "_missing"):
+            setattr(grown, name, getattr(self, name).copy())
+        return grown
+
     def _screen(self, frames: FrameStatistics) -> None:
         """Count the samples that were left out as those of cosmic rays."""
         if frames.reject is None:

@@ -156,7 +156,10 @@ def _masked(statistics: FrameStatistics, mask: Array | None) -> FrameStatistics:
     return dataclasses.replace(statistics, **kept)
 
 
-def _subtract(statistics: FrameStatistics, dark: FrameStatistics | Array | None) -> FrameStatistics:
+def subtracted(
+    statistics: FrameStatistics, dark: FrameStatistics | Array | None
+) -> FrameStatistics:
+    """Subtract the mean of a dark; refuse one that does not fit."""
     if dark is None:
         return statistics
     if statistics.dark is not None:

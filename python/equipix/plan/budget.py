@@ -179,7 +179,7 @@ def error_budget(
     waves = pattern_errors.spectrum(exact, powers)
     # Between pixels no part of the sensor is unconnected: each is compared with parts of cells.
     parts = identify(sizes, positions).components
-    components = 1 if _between_pixels(exact) else parts
+    components = 1 if between_pixels(exact) else parts
     local = LocalVariance(sizes, positions, powers, beam_width)
     by_noise = noise * np.sqrt(pattern_errors.factor(sizes, positions, powers) * local.mean)
     drifted = tilt_of_fluxes(sizes, exact, drift)
@@ -218,7 +218,7 @@ def check_causes(
         positive("beam_width", beam_width)
 
 
-def _between_pixels(shifts: Floats) -> bool:
+def between_pixels(shifts: Floats) -> bool:
     """Whether shifts lie between pixels.
 
     Such shifts compare each pixel with parts of several cells, so no part of the sensor is
@@ -231,7 +231,7 @@ def _between_pixels(shifts: Floats) -> bool:
 def _on_wave(budget: ErrorBudget) -> str | None:
     """Say that a wave is periodic in all of shifts between pixels."""
     waves = budget.spectrum
-    if not (_between_pixels(budget.shifts) and np.isfinite(waves.worst).all()):
+    if not (between_pixels(budget.shifts) and np.isfinite(waves.worst).all()):
         return None
     if not pattern_errors.smallest_near(waves, budget.shifts) < _UNDETERMINED:
         return None
@@ -244,7 +244,7 @@ def _on_wave(budget: ErrorBudget) -> str | None:
 
 def _on_components(budget: ErrorBudget) -> str | None:
     """Say that shifts of whole pixels leave parts of the sensor unconnected."""
-    if budget.components <= 1 or _between_pixels(budget.shifts):
+    if budget.components <= 1 or between_pixels(budget.shifts):
         return None
     return (
         f"the shifts leave {budget.components} parts of the sensor unconnected: the errors are "

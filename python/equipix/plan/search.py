@@ -208,6 +208,73 @@ def suggest(
     return suggestions[:wanted]
 
 
+_NEXT, _NEXT_FINALISTS = 1024, 24
+"""Places of a next position that are compared, and how many of the best are looked at closely."""
+
+
+def next_position(
+    shape: tuple[int, int],
+    shifts: Floats,
+    travel: ArrayLike,
+    *,
+    noise: float,
+    drift: float,
+    cfa: Colours | None = None,
+) -> Floats:
+    """Find the position that lowers the error of a pattern most when it is added.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Rows and columns of the sensor.
+    shifts : ndarray, shape (n, 2)
+        Positions (row, col) so far, at least one.
+    travel : int or array_like of two
+        Travel of the stage from the smallest position so far, in pixels; at least their span.
+    noise, drift : float
+        As for `error_budget`.
+    cfa : Colours, optional
+        Colour filters of the pixels.
+
+    Returns
+    -------
+    ndarray, shape (2,)
+        The position, whole pixels from the first: of those that connect the most pixels the one
+        of the least predicted error. It is none of the positions so far.
+    """
+    low = shifts.min(axis=0)
+    points = np.rint(shifts - shifts[0]).astype(np.int64)
+    corner = points.min(axis=0)
+    points = points - corner
+    reach = np.maximum(_travel(travel, shape), points.max(axis=0))
+    score = _Score(shape, reach, noise, drift)
+    every = int(np.prod(reach + 1))
+    taken = {tuple(each) for each in points.tolist()}
+    # Spread evenly over the travel, always the same.
+    numbers = np.unique(np.linspace(0, every - 1, min(every, _NEXT)).astype(np.int64))
+    places = np.stack(np.unravel_index(numbers, reach + 1), axis=1)
+    best = _ranked(score, points, places, taken)[:1]
+    around = np.stack(np.meshgrid(*[np.arange(-3, 4)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
+    near = [np.clip(place + around, 0, reach) for place in (*best, *points)]
+    candidates = _ranked(score, points, np.unique(np.concatenate([places, *near]), axis=0), taken)
+    if not len(candidates):
+        raise InputError(f"'max_shift' is {reach.tolist()}: all positions within it are taken")
+
+    def connected(place: Points) -> bool:
+        return is_connected(shape, np.concatenate([points, place[None]]), cfa)
+
+    finalists = candidates[:_NEXT_FINALISTS]
+    chosen = next((each for each in finalists if connected(each)), finalists[0])
+    return np.asarray(low + chosen, dtype=np.float64)
+
+
+def _ranked(score: "_Score", points: Points, places: Points, taken: set[Any]) -> Points:
+    """Sort places by the error of the pattern with each, without those that are taken."""
+    free = np.array([tuple(each) not in taken for each in places.tolist()], dtype=bool)
+    places = places[free]
+    return np.asarray(places[np.argsort(score(points, places), kind="stable")])
+
+
 def weighed(error: ArrayLike, passes: ArrayLike) -> Floats:
     """Error that counts in a comparison of patterns: more where the solver takes too long.
 

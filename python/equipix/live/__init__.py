@@ -1,0 +1,1 @@
+"""Calibration while the camera works: running averages, what they determine, what helps next."""

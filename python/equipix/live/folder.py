@@ -1,0 +1,267 @@
+"""Frames that a camera writes to a folder, taken into running averages."""
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from glob import has_magic
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from equipix.errors import EquipixError, FileError
+from equipix.experiment.described import excluded_pixels
+from equipix.experiment.manifest import Manifest, read_manifest
+from equipix.findings import Finding
+from equipix.io.arrivals import wait_for_change
+from equipix.io.binary import split
+from equipix.io.frames import stream_frames
+from equipix.io.paths import find_files
+from equipix.live.running import Running
+from equipix.measured.statistics import saved_shape
+
+_SETTLED = 0.4
+"""Seconds for which a file must not have changed before it is read: a camera writes on."""
+
+_LOOK, _AT_ONCE = 2.0, 5.0
+"""Most seconds between two looks at the folder, and between two estimates while frames arrive."""
+
+_GIVEN_UP = 5.0
+"""Seconds without a change after which a file that cannot be read is reported. It is tried again
+when it changes."""
+
+_State = tuple[int, int]
+"""Size and time of the last change of a file, in nanoseconds."""
+
+_KEYS = ("aperture_before", "flux", "flux_std", "time", "shift_std")
+"""Keys of an exposure that a live estimate does not take."""
+
+
+@dataclass
+class WatchedFolder:
+    """A folder with an experiment.toml, whose frames arrive while it is watched.
+
+    Nothing but the files is kept: after the end of the process, whatever its reason, the same files
+    give the same averages again.
+
+    Attributes
+    ----------
+    folder : Path
+        The folder that is watched.
+    path : Path
+        The experiment.toml, which gives positions and dark frames. It is read again when it
+        changes.
+    workers : int or None
+        Number of threads.
+    """
+
+    folder: Path
+    path: Path
+    workers: int | None = None
+    _manifest: Manifest | None = None
+    _state: _State | None = None
+    _running: Running | None = None
+    _begun: int = 0
+    _wanted: tuple[tuple[int, ...], np.dtype[Any]] | None = None
+    _taken: dict[Path, _State] = field(default_factory=dict)
+    _shapes: dict[Path, tuple[tuple[int, ...], np.dtype[Any]]] = field(default_factory=dict)
+    _refused: dict[Path, _State] = field(default_factory=dict)
+    _reported: set[tuple[Path, str]] = field(default_factory=set)
+
+    @property
+    def running(self) -> Running | None:
+        """The averages so far; None before the first frame."""
+        return self._running
+
+    @property
+    def names(self) -> dict[tuple[float, float], str]:
+        """Name of each position."""
+        exposures = [] if self._manifest is None else self._manifest.exposure
+        return {_place(each.shift): each.name for each in reversed(exposures)}
+
+    def changes(self) -> Iterator[list[Finding]]:
+        """Give, whenever frames have arrived and the folder is quiet, which files are not used.
+
+        It never ends by itself. While frames go on arriving it gives every few seconds.
+        """
+        told, fresh, found = time.monotonic(), False, list[Finding]()
+        while True:
+            new, waiting, more = self.look()
+            fresh, found = fresh or new, found + more
+            if (fresh or found) and (not waiting or time.monotonic() - told > _AT_ONCE):
+                yield found
+                told, fresh, found = time.monotonic(), False, []
+                continue  # an estimate takes long enough for files to have settled
+            if waiting:
+                time.sleep(_SETTLED / 2)
+            else:
+                wait_for_change(self.folder, _LOOK)
+
+    def look(self) -> tuple[bool, bool, list[Finding]]:
+        """Take the frames of files that are complete.
+
+        Returns
+        -------
+        new : bool
+            Whether the averages have changed.
+        waiting : bool
+            Whether a file is still being written.
+        findings : list of Finding
+            Files that are not used, each once for each reason.
+        """
+        self._read_manifest()
+        files, waiting, found = self._files(), False, list[Finding]()
+        new, begun = self._forget_changed(files), self._begun
+        for file, (position, state) in files.items():
+            if state in (self._taken.get(file), self._refused.get(file)):
+                continue
+            age = time.time() - state[1] / 1e9
+            if 0 <= age < _SETTLED:
+                waiting = True
+                continue
+            try:
+                stacks = _frames_of(file)
+                if _state_of(file) == state:
+                    self._take(file, position, stacks)
+                    self._taken[file], new = state, True
+            except EquipixError as error:
+                # A file that is half written now is whole later.
+                if not 0 <= age < _GIVEN_UP:
+                    self._refused[file] = state
+                    found += self._finding(file, str(error))
+        if self._begun > begun:  # the first file was the odd one, and others were refused
+            self._refused.clear()
+            self._reported.clear()
+            return self.look()
+        return new, waiting, found
+
+    def _take(
+        self, file: Path, position: tuple[float, float] | None, stacks: list[NDArray[Any]]
+    ) -> None:
+        """Add the frames of a file; refuse them if most files have another format."""
+        self._shapes[file] = kind = stacks[0].shape[1:], stacks[0].dtype
+        wanted = Counter(self._shapes.values()).most_common(1)[0][0]
+        if self._running is not None and self._wanted != wanted:
+            self._forget()
+            self._begun += 1
+        if kind != wanted:
+            raise FileError(
+                f"{file}: holds {kind[1]} frames of shape {kind[0]}, expected {wanted[1]} of shape "
+                f"{wanted[0]} as most files: use a copy, or take the frames again"
+            )
+        if self._running is None:
+            self._running, self._wanted = self._begin(kind[0]), wanted
+        for stack in stacks:
+            self._running.add(stack, position)
+
+    def _begin(self, shape: tuple[int, ...]) -> Running:
+        assert self._manifest is not None
+        sensor, (rows, cols) = self._manifest.sensor, shape
+        return Running(
+            (rows, cols),
+            saturation=sensor.saturation_level,
+            mask=excluded_pixels(self.path, self._manifest, (rows, cols)),
+            cfa=sensor.cfa,
+            workers=self.workers,
+        )
+
+    def _forget(self) -> None:
+        """Begin anew: sums do not give back what was added."""
+        self._running, self._taken, self._refused = None, {}, {}
+
+    def _forget_changed(self, files: dict[Path, tuple[Any, _State]]) -> bool:
+        """Begin anew where a file that was taken has changed or is gone."""
+        for file in [each for each in self._shapes if each not in files]:
+            del self._shapes[file]
+        kept = all(file in files and files[file][1] == was for file, was in self._taken.items())
+        if kept:
+            return False
+        self._forget()
+        return True
+
+    def _finding(self, file: Path, message: str) -> list[Finding]:
+        """Say once why a file is not used."""
+        if (file, message) in self._reported:
+            return []
+        self._reported.add((file, message))
+        return [Finding("unused", message, "input")]
+
+    def _read_manifest(self) -> None:
+        """Read the experiment.toml where it is new or has changed, and begin anew."""
+        state = _state_of(self.path)
+        if self._manifest is not None and state == self._state:
+            return
+        manifest = read_manifest(self.path, Manifest)
+        _refuse_more(self.path, manifest)
+        if self._manifest is not None:
+            self._forget()
+        self._manifest, self._state = manifest, state
+
+    def _files(self) -> dict[Path, tuple[tuple[float, float] | None, _State]]:
+        """Files that are there, with the position of their exposure, or None of dark frames."""
+        manifest = self._manifest
+        assert manifest is not None
+        assert manifest.dark is not None
+        named: list[tuple[str | list[str], tuple[float, float] | None]]
+        named = [(each.frames, None) for each in manifest.dark]
+        named += [(each.frames, _place(each.shift)) for each in manifest.exposure]
+        found: dict[Path, tuple[tuple[float, float] | None, _State]] = {}
+        for entry, position in named:
+            for name in [entry] if isinstance(entry, str) else entry:
+                for file in _existing(name, self.path.parent):
+                    state = _state_of(file)
+                    if state is None:
+                        continue
+                    if found.get(file, (position,))[0] != position:
+                        raise FileError(f"{self.path}: names '{file.name}' for two positions")
+                    path = file if manifest.layout is None else manifest.layout.behind(file)
+                    found[path] = position, state
+        return found
+
+
+def _place(shift: list[float] | None) -> tuple[float, float]:
+    row, col = shift or (0.0, 0.0)
+    return row + 0.0, col + 0.0
+
+
+def _existing(name: str, folder: Path) -> list[Path]:
+    try:
+        return find_files(name, folder=folder)
+    except FileError:
+        if (folder / name).is_dir() and not has_magic(name):
+            raise
+        return []  # not written yet
+
+
+def _state_of(file: Path) -> _State | None:
+    """Size and time of a file; None where there is none."""
+    try:
+        held = Path(split(str(file))[0]).stat()
+    except OSError:
+        return None
+    return held.st_size, held.st_mtime_ns
+
+
+def _frames_of(file: Path) -> list[NDArray[Any]]:
+    """All frames of a file, before any is used: the last may be missing."""
+    if saved_shape(file) is not None:
+        raise FileError(f"{file}: holds averaged frames, expected frames of the camera")
+    return [np.array(frames) for _, frames in stream_frames([file])]
+
+
+def _refuse_more(path: Path, manifest: Manifest) -> None:
+    """Refuse what a live estimate does not take."""
+    if manifest.dark is None or len(manifest.dark) > 1:
+        raise FileError(f"{path}: equipix watch takes one table [dark], expected just one")
+    for number, each in enumerate(manifest.exposure, start=1):
+        given = [key for key in _KEYS if getattr(each, key) is not None]
+        given += ["rotation"] if each.rotation else []
+        if given:
+            raise FileError(
+                f"{path}: '{given[0]}' in [[exposure]] {number} ('{each.name}') is not for equipix "
+                "watch: give 'shift' alone, and use equipix calibrate with it at the end"
+            )
+        if each.shift is None and number > 1:
+            raise FileError(f"{path}: [[exposure]] {number} ('{each.name}') needs 'shift'")
