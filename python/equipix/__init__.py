@@ -20,6 +20,7 @@ _HOMES = {
     "Polynomial": "correction.polynomial",
     "__version__": "_native",
     "average": "measured.average",
+    "batch": "",
     "bolometer": "",
     "calibrate": "calibration.calibrate",
     "combine": "correction.polynomial",

@@ -1,0 +1,167 @@
+"""Tasks on the workers of dask.distributed, each when the memory for it is free."""
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+from equipix.batch.evaluation import Job, Row
+from equipix.errors import EquipixError
+
+_MEMORY = "equipix-memory"
+"""The resource of dask that workers have as many of as bytes."""
+
+_SHARE = 0.9
+"""Share of a machine's free memory that its workers may take."""
+
+_SUBMISSIONS = 4
+"""Times that a sensor is sent, if workers or the scheduler end meanwhile."""
+
+_TIMEOUT_S = 30
+
+
+class Task(NamedTuple):
+    """A job, and the bytes that it needs at the peak."""
+
+    job: Job
+    memory: int
+
+
+def finished(
+    work: Callable[[Job, int | None], Row],
+    tasks: list[Task],
+    scheduler: str | None,
+    workers: int | None,
+) -> Iterator[tuple[Task, Row | str]]:
+    """Each task with its row, or with the reason why there is none, as workers finish them."""
+    if not tasks:
+        return
+    with _client(scheduler, tasks, workers) as client:
+        largest = _declare(client)
+        waiting: dict[Any, tuple[Task, int]] = {}
+        from distributed import as_completed
+
+        pool = as_completed()
+
+        def send(task: Task, times: int) -> None:
+            future = client.submit(
+                _on_worker, work, task.job, pure=False, resources={_MEMORY: task.memory}, retries=0
+            )
+            waiting[future.key] = task, times
+            pool.add(future)
+
+        for task in sorted(tasks, key=lambda task: -task.memory):
+            if task.memory > largest:
+                yield (
+                    task,
+                    (
+                        f"needs {task.memory / 1e9:.1f} GB, and the largest worker has "
+                        f"{largest / 1e9:.1f} GB: give a worker more memory, or bin the frames"
+                    ),
+                )
+            else:
+                send(task, 1)
+        if not waiting:
+            return
+        for future in pool:
+            task, times = waiting.pop(future.key)
+            if future.status == "finished":
+                yield task, future.result()
+            elif future.status == "error":
+                yield task, _in_words(future.exception())
+            elif times < _SUBMISSIONS:
+                # The scheduler ended; what was written whole is kept.
+                _wait(client)
+                send(task, times + 1)
+            else:
+                yield task, f"the scheduler ended {times} times"
+
+
+def _in_words(error: BaseException) -> str:
+    """Why a worker gave no row."""
+    from distributed import KilledWorker
+
+    if isinstance(error, KilledWorker):
+        return "the processes that worked on it ended again and again, perhaps for lack of memory"
+    return f"the worker could not begin: {type(error).__name__}: {error}"
+
+
+def _wait(client: Any) -> None:
+    """Wait until there is a worker."""
+    try:
+        client.wait_for_workers(1, timeout=_TIMEOUT_S)
+    except TimeoutError as error:
+        raise EquipixError(
+            f"no worker came within {_TIMEOUT_S} s: start one with 'dask worker ADDRESS'"
+        ) from error
+
+
+def _on_worker(work: Callable[[Job, int | None], Row], job: Job) -> Row:
+    """Do the work with as many threads as the worker has."""
+    from distributed import get_worker
+
+    return work(job, get_worker().state.nthreads)
+
+
+@contextmanager
+def _client(scheduler: str | None, tasks: list[Task], workers: int | None) -> Iterator[Any]:
+    """A client of the scheduler, or of a cluster on this machine that ends with it."""
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        raise EquipixError(
+            "a batch needs dask.distributed, which is not installed: pip install 'equipix[batch]'"
+        ) from error
+    if scheduler is not None:
+        try:
+            client = Client(scheduler, timeout=f"{_TIMEOUT_S}s")
+        except (OSError, ValueError) as error:
+            raise EquipixError(
+                f"the scheduler '{scheduler}' cannot be reached ({error}): name it as "
+                "tcp://HOST:PORT, and see that it runs"
+            ) from error
+        with client:
+            yield client
+        return
+    processors, free = len(os.sched_getaffinity(0)), _free_memory()
+    fitting = [task.memory for task in tasks if task.memory <= free] or [free]
+    count = workers or max(1, min(processors, len(tasks), free // max(fitting)))
+    cluster = LocalCluster(
+        n_workers=count,
+        threads_per_worker=max(1, processors // count),
+        processes=True,
+        memory_limit=0,
+        dashboard_address=None,
+        resources={_MEMORY: free // count},
+    )
+    with cluster, Client(cluster) as client:
+        yield client
+
+
+def _free_memory() -> int:
+    """Bytes that the workers of this machine may take."""
+    import psutil
+    from distributed.system import MEMORY_LIMIT  # of the machine or its control groups
+
+    return int(_SHARE * min(psutil.virtual_memory().available, MEMORY_LIMIT))
+
+
+def _declare(client: Any) -> int:
+    """Let workers without the resource have their memory as one; bytes of the largest."""
+    from distributed import WorkerPlugin
+
+    class Memory(WorkerPlugin):  # type: ignore[misc]
+        """Declares the memory of a worker, when it starts."""
+
+        name = _MEMORY
+
+        async def setup(self, worker: Any) -> None:
+            """Have as many of the resource as bytes."""
+            if _MEMORY not in worker.state.total_resources:
+                limit = worker.memory_manager.memory_limit or _free_memory()
+                await worker.set_resources(**{_MEMORY: limit})
+
+    _wait(client)
+    client.register_plugin(Memory())
+    known = client.run(lambda dask_worker: dask_worker.state.total_resources[_MEMORY])
+    return int(max(known.values()))

@@ -1,0 +1,223 @@
+"""Lots of sensors on a cluster of two processes: rows, files, what is kept, what faults leave."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from given import written_experiment
+
+import equipix
+from equipix import batch, errors
+from equipix.batch.cluster import Task, finished
+from equipix.batch.evaluation import Job, Row
+from equipix.io.tiff import write_frames
+from equipix.report.limits import LimitsFile, limits_template
+
+SHIFTS = [(0, 0), (0, 5), (0, 9), (5, 0), (9, 0)]
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """Two worker processes of one thread each."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, memory_limit=0
+    ) as cluster:
+        yield cluster
+
+
+def write_levels(folder):
+    """Write three levels of a uniform source."""
+    rng, lines = np.random.default_rng(5), []
+    folder.mkdir()
+    for number in range(3):
+        frames = np.rint(rng.normal(300 + 900 * number, 8, (4, 40, 50))).astype(np.uint16)
+        write_frames(folder / f"{number}.tif", frames, nbytes=frames.nbytes)
+        lines.append(f'[[level]]\nframes = "{number}.tif"')
+    (folder / "levels.toml").write_text("[sensor]\nbit_depth = 12\n" + "\n".join(lines))
+    return folder / "levels.toml"
+
+
+@pytest.fixture
+def lot(tmp_path):
+    """Two experiments and one of levels."""
+    manifests = []
+    for name, shape in (("a", (90, 110)), ("b", (80, 120))):
+        manifests.append(written_experiment(tmp_path / name, shape, SHIFTS))
+    (tmp_path / "lot").mkdir()
+    return [*manifests, write_levels(tmp_path / "lot" / "levels")]
+
+
+def run(lot, tmp_path, cluster, **options):
+    return batch.run(lot, tmp_path / "results", scheduler=cluster.scheduler_address, **options)
+
+
+def test_each_sensor_has_a_result_a_page_and_a_row(lot, tmp_path, cluster):
+    (tmp_path / "limits.toml").write_text(limits_template())
+    found = run(lot, tmp_path, cluster, limits=tmp_path / "limits.toml", order=0)
+    assert [row.sensor for row in found.rows] == ["a-experiment", "b-experiment", "lot-levels"]
+    assert [row.status for row in found.rows] == ["done"] * 3
+    for row in found.rows:
+        assert (tmp_path / "results" / row.report).read_text().startswith("<!doctype html>")
+        assert equipix.load(tmp_path / "results" / row.result).shape
+        written = json.loads((tmp_path / "results" / f"{row.sensor}.json").read_text())
+        assert Row(**written) == row
+    columns = found.columns
+    with (tmp_path / "results" / "lot.csv").open(newline="") as file:
+        rows = [*csv.DictReader(file)]
+    assert [row["sensor"] for row in rows] == columns["sensor"]
+    assert [float(row["reduced_chi2"]) for row in rows[:2]] == columns["reduced_chi2"][:2]
+    parquet = pytest.importorskip("pyarrow.parquet")
+    assert parquet.read_table(tmp_path / "results" / "lot.parquet").to_pydict() == columns
+    good, of = found.yields["converged"]
+    assert (good, of) == (2, 2)
+    page = (tmp_path / "results" / "lot.html").read_text()
+    assert f'<a href="{found.rows[0].report}">' in page
+
+
+def test_results_are_those_of_one_process(lot, tmp_path, cluster):
+    """The same bytes of every array and the same metadata, but for times."""
+    found = run(lot, tmp_path, cluster)
+    for manifest, row in zip(lot[:2], found.rows, strict=False):
+        alone = equipix.Experiment.load(manifest).run()
+        alone.save(tmp_path / "alone.tif", force=True)
+        one, other = (
+            equipix.load(file)
+            for file in (tmp_path / "alone.tif", tmp_path / "results" / row.result)
+        )
+        for name in ("sensitivity", "flags", "beam", "shifts", "flux"):
+            assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
+        times = {"started", "finished", "created", "seconds"}
+        first, second = (
+            {name: value for name, value in each.metadata.items() if name not in times}
+            for each in (one, other)
+        )
+        assert first == second
+
+
+def test_what_is_the_same_is_kept(lot, tmp_path, cluster):
+    first = run(lot, tmp_path, cluster)
+    again = run(lot, tmp_path, cluster)
+    assert [row.status for row in again.rows] == ["kept"] * 3
+    assert [row.key for row in again.rows] == [row.key for row in first.rows]
+    # An option, an input, a lost result.
+    assert [row.status for row in run(lot, tmp_path, cluster, tolerance=1e-5).rows] == ["done"] * 3
+    run(lot, tmp_path, cluster)
+    frames = np.full((4, 40, 50), 700, np.uint16)
+    frames[::2] += 9
+    write_frames(tmp_path / "lot" / "levels" / "0.tif", frames, nbytes=frames.nbytes)
+    (tmp_path / "results" / again.rows[0].result).unlink()
+    states = [row.status for row in run(lot, tmp_path, cluster).rows]
+    assert states == ["done", "kept", "done"]
+
+
+def test_one_bad_sensor_does_not_stop_the_others(lot, tmp_path, cluster):
+    next((tmp_path / "a" / "experiment" / "dark").iterdir()).unlink()
+    found = run(lot, tmp_path, cluster)
+    assert [row.status for row in found.rows] == ["failed", "done", "done"]
+    assert "dark" in found.rows[0].reason
+    assert "dark" in (tmp_path / "results" / "lot.html").read_text()
+
+
+def test_a_killed_worker_is_replaced(lot, tmp_path, cluster):
+    """SIGKILL to each worker while sensors are evaluated: every one has its result in the end."""
+    from distributed import Client
+
+    with Client(cluster) as client:
+        before = client.run(os.getpid)
+    killer = threading.Timer(0.5, lambda: [os.kill(pid, signal.SIGKILL) for pid in before.values()])
+    killer.start()
+    found = run(lot, tmp_path, cluster)
+    killer.join()
+    assert [row.status for row in found.rows] == ["done"] * 3
+    names = {path.name for path in (tmp_path / "results").iterdir()}
+    wanted = {f"{row.sensor}{end}" for row in found.rows for end in (".json", ".html", ".tif")}
+    assert wanted | {"lot.csv", "lot.parquet", "lot.html"} == names
+    with Client(cluster) as client:
+        client.wait_for_workers(2)
+        assert not set(client.run(os.getpid).values()) & set(before.values())
+
+
+def test_a_sensor_waits_for_its_memory(tmp_path):
+    """A worker of two threads takes two small ones at a time, and large ones one after the other."""
+    from distributed import LocalCluster
+
+    jobs = [Job(f"{k}", tmp_path, tmp_path, ".tif", {}, LimitsFile(), False) for k in range(4)]
+    one = {"n_workers": 1, "threads_per_worker": 2, "memory_limit": 2e9, "dashboard_address": None}
+    with LocalCluster(**one) as cluster:
+        overlaps = {}
+        for memory in (12e8, 5e8):
+            tasks = [Task(job, int(memory)) for job in jobs]
+            rows = [row for _, row in finished(_nap, tasks, cluster.scheduler_address, None)]
+            spans = sorted((row.figures["from"], row.figures["to"]) for row in rows)
+            overlaps[memory] = any(one[1] > other[0] for one, other in pairwise(spans))
+        beyond = [Task(jobs[0], 10**18)]
+        (_, reason), *_ = finished(_nap, beyond, cluster.scheduler_address, None)
+    assert overlaps == {12e8: False, 5e8: True}
+    assert reason.startswith("needs 1000000000.0 GB, and the largest worker has 2.0 GB")
+
+
+def _nap(job, _):
+    began = time.monotonic()
+    time.sleep(0.5)
+    return Row(job.name, "", status="done", figures={"from": began, "to": time.monotonic()})
+
+
+def test_a_full_disk_is_the_reason_and_leaves_nothing_half_written(lot, tmp_path):
+    results = tmp_path / "results"
+    results.mkdir()
+    code = f"""
+import json, resource
+from dataclasses import asdict
+from pathlib import Path
+from equipix.batch.evaluation import Job, evaluate
+from equipix.report.limits import LimitsFile
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+job = Job("a", Path({str(lot[0])!r}), Path({str(results)!r}), ".tif", {{}}, LimitsFile(), False)
+print(json.dumps(asdict(evaluate(job))))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    row = Row(**json.loads(done.stdout))
+    assert row.status == "failed"
+    assert "File too large" in row.reason
+    assert [*results.iterdir()] == []
+
+
+def test_what_cannot_be_a_lot_is_refused(lot, tmp_path, monkeypatch):
+    output = tmp_path / "results"
+    with pytest.raises(errors.InputError, match="'manifests' is empty"):
+        batch.run([], output)
+    with pytest.raises(errors.InputError, match="is named twice"):
+        batch.run([lot[0], lot[0]], output)
+    with pytest.raises(errors.InputError, match="'toleranz' is no option"):
+        batch.run(lot, output, toleranz=1)
+    with pytest.raises(errors.InputError, match=r"\.doc"):
+        batch.run(lot, output, suffix=".doc")
+    assert not output.exists()
+    monkeypatch.setattr("equipix.batch.cluster._TIMEOUT_S", 1)
+    with pytest.raises(errors.EquipixError, match="cannot be reached"):
+        batch.run(lot, output, scheduler="tcp://127.0.0.1:9")
+
+
+def test_the_command_tells_states_and_reasons(lot, tmp_path, run_command, cluster):
+    (tmp_path / "a" / "experiment" / "dark" / "dark.tif").unlink()
+    given = [*lot, "-o", tmp_path / "results", "--scheduler", cluster.scheduler_address]
+    status, out, err = run_command("batch", *given, "--json")
+    told = json.loads(out)
+    assert status == 1
+    assert (told["done"], told["kept"], told["failed"]) == (2, 0, 1)
+    assert "1 of 3 sensors gave no result" in err
+
+
+@pytest.fixture
+def run_command(request):
+    """The fixture `run` of conftest, whose name the helper here has."""
+    return request.getfixturevalue("run")
