@@ -12,7 +12,6 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from given import written_experiment
 
 import equipix
 from equipix import batch, errors
@@ -20,6 +19,7 @@ from equipix.batch.cluster import Task, finished
 from equipix.batch.evaluation import Job, Row
 from equipix.io.tiff import write_frames
 from equipix.report.limits import LimitsFile, limits_template
+from given import written_experiment
 
 SHIFTS = [(0, 0), (0, 5), (0, 9), (5, 0), (9, 0)]
 
@@ -147,7 +147,7 @@ def test_a_killed_worker_is_replaced(lot, tmp_path, cluster):
 
 
 def test_a_sensor_waits_for_its_memory(tmp_path):
-    """A worker of two threads takes two small ones at a time, and large ones one after the other."""
+    """A worker of two threads takes two small ones at a time, and large ones one by one."""
     from distributed import LocalCluster
 
     jobs = [Job(f"{k}", tmp_path, tmp_path, ".tif", {}, LimitsFile(), False) for k in range(4)]
