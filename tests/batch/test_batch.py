@@ -133,7 +133,7 @@ def test_a_killed_worker_is_replaced(lot, tmp_path, cluster):
 
     with Client(cluster) as client:
         before = client.run(os.getpid)
-    killer = threading.Timer(0.5, lambda: [os.kill(pid, signal.SIGKILL) for pid in before.values()])
+    killer = threading.Timer(2.5, lambda: [os.kill(pid, signal.SIGKILL) for pid in before.values()])
     killer.start()
     found = run(lot, tmp_path, cluster)
     killer.join()

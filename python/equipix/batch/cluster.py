@@ -161,7 +161,13 @@ def _declare(client: Any) -> int:
                 limit = worker.memory_manager.memory_limit or _free_memory()
                 await worker.set_resources(**{_MEMORY: limit})
 
-    _wait(client)
-    client.register_plugin(Memory())
+    for last in (False, False, True):
+        _wait(client)
+        try:
+            client.register_plugin(Memory())
+            break
+        except OSError:  # a worker ended meanwhile
+            if last:
+                raise
     known = client.run(lambda dask_worker: dask_worker.state.total_resources[_MEMORY])
     return int(max(known.values()))
