@@ -1,9 +1,12 @@
 """Lots of sensors on a cluster of two processes: rows, files, what is kept, what faults leave."""
 
 import csv
+import functools
 import json
 import os
+import pkgutil
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -16,7 +19,7 @@ import pytest
 import equipix
 from equipix import batch, errors
 from equipix.batch.cluster import Task, finished
-from equipix.batch.evaluation import Job, Row
+from equipix.batch.evaluation import Job, Row, described_by, evaluate
 from equipix.io.tiff import write_frames
 from equipix.report.limits import LimitsFile, limits_template
 from given import written_experiment
@@ -29,7 +32,11 @@ def cluster():
     """Two worker processes of one thread each."""
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, memory_limit=0
+        n_workers=2,
+        threads_per_worker=1,
+        dashboard_address="127.0.0.1:0",
+        memory_limit=0,
+        resources={"equipix-memory": 2e9},
     ) as cluster:
         yield cluster
 
@@ -60,6 +67,7 @@ def run(lot, tmp_path, cluster, **options):
     return batch.run(lot, tmp_path / "results", scheduler=cluster.scheduler_address, **options)
 
 
+@pytest.mark.long
 def test_each_sensor_has_a_result_a_page_and_a_row(lot, tmp_path, cluster):
     (tmp_path / "limits.toml").write_text(limits_template())
     found = run(lot, tmp_path, cluster, limits=tmp_path / "limits.toml", order=0)
@@ -83,6 +91,7 @@ def test_each_sensor_has_a_result_a_page_and_a_row(lot, tmp_path, cluster):
     assert f'<a href="{found.rows[0].report}">' in page
 
 
+@pytest.mark.long
 def test_results_are_those_of_one_process(lot, tmp_path, cluster):
     """The same bytes of every array and the same metadata, but for times."""
     found = run(lot, tmp_path, cluster)
@@ -103,6 +112,7 @@ def test_results_are_those_of_one_process(lot, tmp_path, cluster):
         assert first == second
 
 
+@pytest.mark.long
 def test_what_is_the_same_is_kept(lot, tmp_path, cluster):
     first = run(lot, tmp_path, cluster)
     again = run(lot, tmp_path, cluster)
@@ -119,6 +129,7 @@ def test_what_is_the_same_is_kept(lot, tmp_path, cluster):
     assert states == ["done", "kept", "done"]
 
 
+@pytest.mark.long
 def test_one_bad_sensor_does_not_stop_the_others(lot, tmp_path, cluster):
     next((tmp_path / "a" / "experiment" / "dark").iterdir()).unlink()
     found = run(lot, tmp_path, cluster)
@@ -127,6 +138,7 @@ def test_one_bad_sensor_does_not_stop_the_others(lot, tmp_path, cluster):
     assert "dark" in (tmp_path / "results" / "lot.html").read_text()
 
 
+@pytest.mark.long
 def test_a_killed_worker_is_replaced(lot, tmp_path, cluster):
     """SIGKILL to each worker while sensors are evaluated: every one has its result in the end."""
     from distributed import Client
@@ -146,12 +158,19 @@ def test_a_killed_worker_is_replaced(lot, tmp_path, cluster):
         assert not set(client.run(os.getpid).values()) & set(before.values())
 
 
+@pytest.mark.long
 def test_a_sensor_waits_for_its_memory(tmp_path):
     """A worker of two threads takes two small ones at a time, and large ones one by one."""
     from distributed import LocalCluster
 
     jobs = [Job(f"{k}", tmp_path, tmp_path, ".tif", {}, LimitsFile(), False) for k in range(4)]
-    one = {"n_workers": 1, "threads_per_worker": 2, "memory_limit": 2e9, "dashboard_address": None}
+    one = {
+        "n_workers": 1,
+        "threads_per_worker": 2,
+        "memory_limit": 0,
+        "dashboard_address": "127.0.0.1:0",
+    }
+    one["resources"] = {"equipix-memory": 2e9}
     with LocalCluster(**one) as cluster:
         overlaps = {}
         for memory in (12e8, 5e8):
@@ -163,6 +182,27 @@ def test_a_sensor_waits_for_its_memory(tmp_path):
         (_, reason), *_ = finished(_nap, beyond, cluster.scheduler_address, None)
     assert overlaps == {12e8: False, 5e8: True}
     assert reason.startswith("needs 1000000000.0 GB, and the largest worker has 2.0 GB")
+
+
+def test_without_declared_memory_nothing_is_sent(tmp_path):
+    from distributed import LocalCluster
+
+    tasks = [Task(Job("a", tmp_path, tmp_path, ".tif", {}, LimitsFile(), False), 1)]
+    one = {"n_workers": 1, "processes": False, "dashboard_address": "127.0.0.1:0"}
+    with (
+        LocalCluster(**one) as cluster,
+        pytest.raises(errors.EquipixError, match="--resources equipix-memory=BYTES"),
+    ):
+        next(finished(_nap, tasks, cluster.scheduler_address, None))
+
+
+@pytest.mark.long
+def test_where_all_is_kept_no_cluster_starts(lot, tmp_path, monkeypatch):
+    first = batch.run(lot[2:], tmp_path / "results")
+    assert [row.status for row in first.rows] == ["done"]
+    monkeypatch.setattr("distributed.LocalCluster", None)
+    again = batch.run(lot[2:], tmp_path / "results")
+    assert [row.status for row in again.rows] == ["kept"]
 
 
 def _nap(job, _):
@@ -187,7 +227,7 @@ print(json.dumps(asdict(evaluate(job))))
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     row = Row(**json.loads(done.stdout))
     assert row.status == "failed"
-    assert "File too large" in row.reason
+    assert "a.tif: cannot be written" in row.reason
     assert [*results.iterdir()] == []
 
 
@@ -207,6 +247,7 @@ def test_what_cannot_be_a_lot_is_refused(lot, tmp_path, monkeypatch):
         batch.run(lot, output, scheduler="tcp://127.0.0.1:9")
 
 
+@pytest.mark.long
 def test_the_command_tells_states_and_reasons(lot, tmp_path, run_command, cluster):
     (tmp_path / "a" / "experiment" / "dark" / "dark.tif").unlink()
     given = [*lot, "-o", tmp_path / "results", "--scheduler", cluster.scheduler_address]
@@ -221,3 +262,146 @@ def test_the_command_tells_states_and_reasons(lot, tmp_path, run_command, cluste
 def run_command(request):
     """The fixture `run` of conftest, whose name the helper here has."""
     return request.getfixturevalue("run")
+
+
+def _kill(seconds, then):
+    """Call `then` and be gone by SIGKILL after some seconds, or when it has ended."""
+
+    def called(*given, **options):
+        threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGKILL)).start()
+        then(*given, **options)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    return called
+
+
+_PHASES = {
+    "average": ("equipix._native.average_files", 0.002),
+    "solve": ("equipix.calibration.calibrate.weighted_fit", 0.02),
+    "write": ("equipix.batch.evaluation.write_page", 0.02),
+    "replace": ("pathlib.Path.replace", 0),
+}
+
+
+def _killed_while(phase, job, workers):
+    """Evaluate; the first attempt ends by SIGKILL in a phase."""
+    mark = job.output.parent / f"{job.name}.{phase}"
+    if not mark.exists():
+        mark.touch()
+        place, seconds = _PHASES[phase]
+        owner, name = pkgutil.resolve_name(place.rpartition(".")[0]), place.rpartition(".")[2]
+        setattr(owner, name, _kill(seconds, getattr(owner, name)))
+    return evaluate(job, workers)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("phase", _PHASES)
+def test_a_worker_killed_in_a_phase_leaves_whole_files(lot, tmp_path, cluster, phase):
+    output = tmp_path / "results"
+    output.mkdir()
+    jobs = [Job(f"{k}", lot[k], output, ".tif", {}, LimitsFile(), False) for k in range(2)]
+    work = functools.partial(_killed_while, phase)
+    found = finished(work, [Task(job, 1) for job in jobs], cluster.scheduler_address, None)
+    assert [row.status for _, row in found] == ["done"] * 2
+    assert (tmp_path / f"0.{phase}").exists()
+    for k in range(2):
+        alone = equipix.Experiment.load(lot[k]).run()
+        there = equipix.load(output / f"{k}.tif")
+        assert there.sensitivity.tobytes() == alone.sensitivity.tobytes()
+        assert Row(**json.loads((output / f"{k}.json").read_text())).status == "done"
+
+
+def _program(*arguments):
+    return subprocess.Popen(
+        [sys.executable, "-m", "distributed.cli." + arguments[0], *arguments[1:]],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+
+
+def _cluster_at(port):
+    """Start a scheduler and a worker; both end with what is returned."""
+    scheduler = _program("dask_scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard")
+    worker = _program(
+        "dask_worker",
+        f"tcp://127.0.0.1:{port}",
+        "--nworkers",
+        "2",
+        "--nthreads",
+        "1",
+        "--no-dashboard",
+        "--resources",
+        "equipix-memory=2e9",
+    )
+    return scheduler, worker
+
+
+def _slow(job, _):
+    time.sleep(3)
+    (job.output / f"{job.name}").touch()
+    return Row(job.name, "", status="done")
+
+
+@pytest.mark.long
+def test_a_scheduler_that_starts_again_gets_the_rest(tmp_path):
+    pytest.importorskip("distributed")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    jobs = [Job(f"{k}", tmp_path, tmp_path, ".tif", {}, LimitsFile(), False) for k in range(6)]
+    programs = [*_cluster_at(port)]
+    try:
+        found = finished(_slow, [Task(job, 1) for job in jobs], f"tcp://127.0.0.1:{port}", None)
+        rows = [next(found)[1]]
+        programs[0].kill()
+        programs[0].wait()
+        programs[1].terminate()
+        programs[1].wait()
+        programs += _cluster_at(port)
+        rows += [row for _, row in found]
+    finally:
+        for each in programs[::-1]:
+            each.terminate()
+            each.wait()
+    assert sorted(row.sensor for row in rows) == [job.name for job in jobs]
+    assert {row.status for row in rows} == {"done"}
+
+
+@pytest.mark.long
+def test_a_disk_that_is_full_is_told_and_the_rest_done_later(lot, tmp_path, cluster):
+    """Disk of 500 kB, later of 50 MB."""
+    output = tmp_path / "results"
+    output.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o"]
+    made = subprocess.run([*mount, "size=500k", "none", output], capture_output=True, check=False)
+    if made.returncode:
+        pytest.skip("mount is not allowed; the test with a limit of file sizes stands in")
+    try:
+        with pytest.raises(errors.FileError, match="cannot be written"):
+            run(lot, tmp_path, cluster)
+        assert not [*output.glob(".*")]
+        for file in output.glob("*.json"):
+            row = Row(**json.loads(file.read_text()))
+            assert equipix.load(output / row.result).shape
+        subprocess.run(["mount", "-o", "remount,size=50m", output], check=True)
+        assert not run(lot, tmp_path, cluster).failed
+    finally:
+        subprocess.run(["umount", output], check=True)
+
+
+def _vanished(job, workers):
+    """Evaluate; the first image goes when the manifest is read."""
+    described = described_by(job.manifest)
+    described.files()[0].unlink()
+    return evaluate(job, workers)
+
+
+@pytest.mark.long
+def test_an_input_that_vanishes_is_the_reason(lot, tmp_path, cluster):
+    output = tmp_path / "results"
+    output.mkdir()
+    jobs = [Job("a", lot[0], output, ".tif", {}, LimitsFile(), False)]
+    ((_, row),) = finished(_vanished, [Task(jobs[0], 1)], cluster.scheduler_address, None)
+    assert row.status == "failed"
+    assert ".tif" in row.reason
+    assert not [*output.iterdir()]

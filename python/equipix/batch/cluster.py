@@ -1,6 +1,7 @@
 """Tasks on the workers of dask.distributed, each when the memory for it is free."""
 
 import os
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -18,6 +19,8 @@ _SUBMISSIONS = 4
 """Times that a sensor is sent, if workers or the scheduler end meanwhile."""
 
 _TIMEOUT_S = 30
+
+_PAUSE_S = 0.2
 
 
 class Task(NamedTuple):
@@ -37,7 +40,8 @@ def finished(
     if not tasks:
         return
     with _client(scheduler, tasks, workers) as client:
-        largest = _declare(client)
+        _wait(client)
+        largest = _largest(client)
         waiting: dict[Any, tuple[Task, int]] = {}
         from distributed import as_completed
 
@@ -87,13 +91,18 @@ def _in_words(error: BaseException) -> str:
 
 
 def _wait(client: Any) -> None:
-    """Wait until there is a worker."""
-    try:
-        client.wait_for_workers(1, timeout=_TIMEOUT_S)
-    except TimeoutError as error:
-        raise EquipixError(
-            f"no worker came within {_TIMEOUT_S} s: start one with 'dask worker ADDRESS'"
-        ) from error
+    """Wait until there is a worker, also where the scheduler starts again meanwhile."""
+    end = time.monotonic() + _TIMEOUT_S
+    while True:
+        try:
+            return client.wait_for_workers(1, timeout=max(1, end - time.monotonic()))
+        except (OSError, ValueError) as error:  # TimeoutError is one; not connected is the other
+            if time.monotonic() > end:
+                raise EquipixError(
+                    f"no worker came within {_TIMEOUT_S} s: start one with 'dask worker ADDRESS "
+                    f"--resources {_MEMORY}=BYTES'"
+                ) from error
+            time.sleep(_PAUSE_S)
 
 
 def _on_worker(work: Callable[[Job, int | None], Row], job: Job) -> Row:
@@ -131,7 +140,7 @@ def _client(scheduler: str | None, tasks: list[Task], workers: int | None) -> It
         threads_per_worker=max(1, processors // count),
         processes=True,
         memory_limit=0,
-        dashboard_address=None,
+        dashboard_address="127.0.0.1:0",
         resources={_MEMORY: free // count},
     )
     with cluster, Client(cluster) as client:
@@ -146,28 +155,14 @@ def _free_memory() -> int:
     return int(_SHARE * min(psutil.virtual_memory().available, MEMORY_LIMIT))
 
 
-def _declare(client: Any) -> int:
-    """Let workers without the resource have their memory as one; bytes of the largest."""
-    from distributed import WorkerPlugin
-
-    class Memory(WorkerPlugin):  # type: ignore[misc]
-        """Declares the memory of a worker, when it starts."""
-
-        name = _MEMORY
-
-        async def setup(self, worker: Any) -> None:
-            """Have as many of the resource as bytes."""
-            if _MEMORY not in worker.state.total_resources:
-                limit = worker.memory_manager.memory_limit or _free_memory()
-                await worker.set_resources(**{_MEMORY: limit})
-
-    for last in (False, False, True):
-        _wait(client)
-        try:
-            client.register_plugin(Memory())
-            break
-        except OSError:  # a worker ended meanwhile
-            if last:
-                raise
-    known = client.run(lambda dask_worker: dask_worker.state.total_resources[_MEMORY])
-    return int(max(known.values()))
+def _largest(client: Any) -> int:
+    """Bytes of the largest worker."""
+    workers = client.scheduler_info(n_workers=-1)["workers"].values()
+    declared = [int(each["resources"].get(_MEMORY, 0)) for each in workers]
+    if not any(declared):
+        # A worker that a nanny starts again has what it was started with, and nothing else.
+        raise EquipixError(
+            f"no worker declares its memory: start each with 'dask worker ADDRESS --resources "
+            f"{_MEMORY}=BYTES', such as {_MEMORY}=16e9"
+        )
+    return max(declared)

@@ -16,7 +16,7 @@ import numpy as np
 
 from equipix._check import LOG
 from equipix._native import __version__
-from equipix.calibration.result import Calibration
+from equipix.calibration.result import Calibration, refuse_partial
 from equipix.errors import EquipixError, EquipixWarning
 from equipix.experiment.camera import CameraExperiment
 from equipix.experiment.experiment import Experiment
@@ -117,9 +117,9 @@ def evaluate(job: Job, workers: int | None = None) -> Row:
     try:
         described = described_by(job.manifest)
         key = key_of(job, described)
-        kept = _kept(job, key)
-        if kept is not None:
-            return kept
+        before = _kept(job, key)
+        if before is not None:
+            return before
         found = replace(_evaluated(job, described, workers), key=key, host=row.host)
         found = replace(found, seconds=time.monotonic() - started)
         _write(job, found)
@@ -152,6 +152,11 @@ def key_of(job: Job, described: Described) -> str:
     return hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()
 
 
+def kept(job: Job, described: Described) -> Row | None:
+    """The row of before, if nothing has changed since."""
+    return _kept(job, key_of(job, described)) if job.path(".json").exists() else None
+
+
 def _kept(job: Job, key: str) -> Row | None:
     """The row of before, if all that it names is there and of the same key."""
     try:
@@ -180,11 +185,9 @@ def _evaluated(job: Job, described: Described, workers: int | None) -> Row:
         known = signature(described.run).parameters
         options = {name: value for name, value in job.options.items() if name in known}
         result = described.run(workers=workers, **options)
-    if isinstance(result, Calibration) and not job.partial:
-        for finding in result.findings:
-            if finding.kind == "partial":
-                raise EquipixError(f"no result (partial=True writes it): {finding.message}")
     output, report = job.path(job.suffix), job.path(".html")
+    if isinstance(result, Calibration) and not job.partial:
+        refuse_partial(result, output)
     result.save(output, force=True)
     part = part_of(job.name, result, job.limits)
     write_page(report, page([part], job.name), force=True)

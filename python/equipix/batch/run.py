@@ -10,7 +10,7 @@ from typing import Any
 
 from equipix._check import LOG, Progress
 from equipix.batch.cluster import Task, finished
-from equipix.batch.evaluation import Job, Row, described_by, evaluate
+from equipix.batch.evaluation import Job, Row, described_by, evaluate, kept
 from equipix.batch.lot import Lot
 from equipix.batch.memory import bytes_needed
 from equipix.errors import EquipixError, FileError, InputError
@@ -136,7 +136,14 @@ def _rows(
     tasks, done = [], 0
     for job in jobs:
         try:
-            tasks.append(Task(job, bytes_needed(described_by(job.manifest), job.options)))
+            described = described_by(job.manifest)
+            # Workers of a cluster look for themselves: they hash inputs side by side.
+            before = kept(job, described) if scheduler is None else None
+            if before is not None:
+                done += 1
+                yield before
+            else:
+                tasks.append(Task(job, bytes_needed(described, job.options)))
         except EquipixError as error:
             done += 1
             yield Row(job.name, str(job.manifest), reason=str(error))
