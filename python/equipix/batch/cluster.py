@@ -1,7 +1,6 @@
 """Tasks on the workers of dask.distributed, each when the memory for it is free."""
 
 import os
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -15,12 +14,10 @@ _MEMORY = "equipix-memory"
 _SHARE = 0.9
 """Share of a machine's free memory that its workers may take."""
 
-_SUBMISSIONS = 4
-"""Times that a sensor is sent, if workers or the scheduler end meanwhile."""
+_ROUNDS = 4
+"""Times that sensors are sent, if the scheduler ends meanwhile."""
 
 _TIMEOUT_S = 30
-
-_PAUSE_S = 0.2
 
 
 class Task(NamedTuple):
@@ -37,48 +34,46 @@ def finished(
     workers: int | None,
 ) -> Iterator[tuple[Task, Row | str]]:
     """Each task with its row, or with the reason why there is none, as workers finish them."""
-    if not tasks:
-        return
-    with _client(scheduler, tasks, workers) as client:
-        _wait(client)
-        largest = _largest(client)
-        waiting: dict[Any, tuple[Task, int]] = {}
-        from distributed import as_completed
-
-        pool = as_completed()
-
-        def send(task: Task, times: int) -> None:
-            future = client.submit(
-                _on_worker, work, task.job, pure=False, resources={_MEMORY: task.memory}, retries=0
-            )
-            waiting[future.key] = task, times
-            pool.add(future)
-
-        for task in sorted(tasks, key=lambda task: -task.memory):
-            if task.memory > largest:
-                yield (
-                    task,
-                    (
-                        f"needs {task.memory / 1e9:.1f} GB, and the largest worker has "
-                        f"{largest / 1e9:.1f} GB: give a worker more memory, or bin the frames"
-                    ),
-                )
-            else:
-                send(task, 1)
-        if not waiting:
+    left = {task.job.name: task for task in sorted(tasks, key=lambda task: -task.memory)}
+    for _ in range(_ROUNDS):
+        if not left:
             return
-        for future in pool:
-            task, times = waiting.pop(future.key)
-            if future.status == "finished":
-                yield task, future.result()
-            elif future.status == "error":
-                yield task, _in_words(future.exception())
-            elif times < _SUBMISSIONS:
-                # The scheduler ended; what was written whole is kept.
-                _wait(client)
-                send(task, times + 1)
-            else:
-                yield task, f"the scheduler ended {times} times"
+        with _client(scheduler, [*left.values()], workers) as client:
+            for task, found in _round(client, work, [*left.values()]):
+                del left[task.job.name]
+                yield task, found
+    for task in left.values():
+        yield task, f"the scheduler ended {_ROUNDS} times"
+
+
+def _round(
+    client: Any, work: Callable[[Job, int | None], Row], tasks: list[Task]
+) -> Iterator[tuple[Task, Row | str]]:
+    """Tasks that are finished until the scheduler ends."""
+    from distributed import as_completed
+
+    _wait(client)
+    largest = _largest(client)
+    sent: dict[Any, Task] = {}
+    for task in tasks:
+        if task.memory > largest:
+            yield (
+                task,
+                f"needs {task.memory / 1e9:.1f} GB, and the largest worker has "
+                f"{largest / 1e9:.1f} GB: give a worker more memory, or bin the frames",
+            )
+        else:
+            future = client.submit(
+                _on_worker, work, task.job, pure=False, resources={_MEMORY: task.memory}
+            )
+            sent[future] = task
+    for future in as_completed(sent):
+        if future.status == "finished":
+            yield sent[future], future.result()
+        elif future.status == "error":
+            yield sent[future], _in_words(future.exception())
+        else:  # lost with the scheduler; the next round keeps what is written whole
+            return
 
 
 def _in_words(error: BaseException) -> str:
@@ -91,18 +86,14 @@ def _in_words(error: BaseException) -> str:
 
 
 def _wait(client: Any) -> None:
-    """Wait until there is a worker, also where the scheduler starts again meanwhile."""
-    end = time.monotonic() + _TIMEOUT_S
-    while True:
-        try:
-            return client.wait_for_workers(1, timeout=max(1, end - time.monotonic()))
-        except (OSError, ValueError) as error:  # TimeoutError is one; not connected is the other
-            if time.monotonic() > end:
-                raise EquipixError(
-                    f"no worker came within {_TIMEOUT_S} s: start one with 'dask worker ADDRESS "
-                    f"--resources {_MEMORY}=BYTES'"
-                ) from error
-            time.sleep(_PAUSE_S)
+    """Wait until there is a worker."""
+    try:
+        client.wait_for_workers(1, timeout=_TIMEOUT_S)
+    except TimeoutError as error:
+        raise EquipixError(
+            f"no worker came within {_TIMEOUT_S} s: start one with 'dask worker ADDRESS "
+            f"--resources {_MEMORY}=BYTES'"
+        ) from error
 
 
 def _on_worker(work: Callable[[Job, int | None], Row], job: Job) -> Row:
