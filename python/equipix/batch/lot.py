@@ -1,7 +1,5 @@
 """A lot of sensors: one table, its yield by limit, and where its sensors fail."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections import Counter, defaultdict
@@ -9,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +17,6 @@ from equipix.io.paths import write_whole
 from equipix.report.maps import Map
 from equipix.report.page import Part, Table, drawn, mapped, page, write_page
 from equipix.shown import Brief
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 _MOST_TRENDS = 12
 """Most figures that are drawn over the lot."""
@@ -185,7 +180,7 @@ def _varies(values: list[Any]) -> bool:
     return numbers and len(set(known)) > 1
 
 
-def _draw(name: str, values: list[float | None], axes: Axes) -> None:
+def _draw(name: str, values: list[float | None], axes: Any) -> None:
     """Draw a figure of each sensor in the order of the lot."""
     known = [np.nan if value is None else value for value in values]
     axes.plot(range(1, len(known) + 1), known, "o", markersize=3)
