@@ -84,7 +84,7 @@ $(BIN)/.installed-bench: $(BIN)/.installed requirements-bench.txt
 
 # Only one build is installed at a time: that of the target asked for.
 $(BIN)/.built-%: $(BIN)/.installed $(SOURCES)
-	$(BIN)/maturin develop --locked --profile $* --extras asdf,codecs,fits,hdf5,plot,raw,report,watch,xarray,zarr
+	$(BIN)/maturin develop --locked --profile $* --extras asdf,batch,codecs,fits,hdf5,plot,raw,report,watch,xarray,zarr
 	rm -f $(BIN)/.built-*
 	touch $@
 

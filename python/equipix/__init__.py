@@ -21,6 +21,7 @@ _HOMES = {
     "Running": "live.running",
     "__version__": "_native",
     "average": "measured.average",
+    "batch": "",
     "bolometer": "",
     "calibrate": "calibration.calibrate",
     "combine": "correction.polynomial",

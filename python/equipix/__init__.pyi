@@ -1,3 +1,4 @@
+from equipix import batch as batch
 from equipix import bolometer as bolometer
 from equipix import detector as detector
 from equipix import errors as errors

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
@@ -25,7 +26,7 @@ from equipix.diagnosis.evidence import Evidence
 from equipix.diagnosis.gauges import gauge_of, scaled
 from equipix.diagnosis.lamp_drift import Drift
 from equipix.diagnosis.orientation import OrientationTest
-from equipix.errors import InputError
+from equipix.errors import EquipixError, InputError
 from equipix.exposures.positions import ROUNDING, Positions, as_rotation
 from equipix.findings import Findings, determined
 from equipix.fitting.error_bars import functional_std
@@ -548,3 +549,12 @@ def checked_weights(weights: ArrayLike, determined: Bools) -> Floats:
             f"the first at ({row}, {col}): set it to 0 there"
         )
     return stack
+
+
+def refuse_partial(calibration: Calibration, output: Path) -> None:
+    """Refuse a result that determines less than half of the unmasked pixels, or none."""
+    for finding in calibration.findings:
+        if finding.kind == "partial":
+            raise EquipixError(
+                f"'{output}' is not written (partial=True writes it): {finding.message}"
+            )

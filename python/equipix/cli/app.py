@@ -42,6 +42,7 @@ COMMANDS = {
     "hardware": ("hardware", "Write a correction as words for a camera's electronics."),
     "simulate": ("simulate", "Write the images of a virtual experiment, and its truth."),
     "demo": ("simulate", "Calibrate a simulated CCD, and compare with the truth and a flat field."),
+    "batch": ("batch", "Evaluate many manifests, on this machine or on a cluster."),
     "plan": ("plan", "Predict the errors of a pattern of shifts, or find better patterns."),
 }
 """The module of each command, and its line in --help, which needs no import of the module."""

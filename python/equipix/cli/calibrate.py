@@ -8,11 +8,11 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from equipix.calibration.result import Calibration
+from equipix.calibration.result import Calibration, refuse_partial
 from equipix.cli import terminal
 from equipix.comparison import Comparison
 from equipix.comparison import compare as compare_calibrations
-from equipix.errors import EquipixError, InputError
+from equipix.errors import InputError
 from equipix.experiment.experiment import Experiment
 from equipix.io.formats import SAVED, SUFFIXES
 from equipix.io.paths import refuse_inputs
@@ -63,22 +63,13 @@ def calibrate(
     loaded = Experiment.load(experiment)
     refuse_inputs([output], [experiment, *loaded.files(), *terminal.given(mask)])
     if not partial:
-        # `_refuse_partial` says the same as an error.
+        # `refuse_partial` says the same as an error.
         warnings.filterwarnings("ignore", "the exposures determine only|the fit ended far from")
     with terminal.working(mask) as (progress, excluded):
         calibration = loaded.run(mask=excluded, workers=workers, progress=progress, **options)
     if not partial:
-        _refuse_partial(calibration, output)
+        refuse_partial(calibration, output)
     terminal.show_saved(output, calibration, force=force, as_json=as_json)
-
-
-def _refuse_partial(calibration: Calibration, output: Path) -> None:
-    """Refuse a result that determines less than half of the unmasked pixels, or none."""
-    for finding in calibration.findings:
-        if finding.kind == "partial":
-            raise EquipixError(
-                f"'{output}' is not written (--partial writes it): {finding.message}"
-            )
 
 
 @commands.command(epilog="Example: equipix inspect cal.tif -o cal.png")

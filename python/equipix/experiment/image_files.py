@@ -37,7 +37,7 @@ def check_formats(files: Sequence[Path], bit_depth: int | None = None) -> tuple[
         If a file cannot be read, or differs in shape from most, or in depth from the first of them;
         or if whole numbers of its type have fewer bits than the sensor.
     """
-    formats = {file: _format(file) for file in files}
+    formats = {file: format_of(file) for file in files}
     wanted = Counter(shape for shape, _ in formats.values()).most_common(1)[0][0]
     first = next(file for file, (shape, _) in formats.items() if shape == wanted)
     wanted_dtype = formats[first][1]
@@ -64,7 +64,7 @@ def _bits(dtype: np.dtype[Any] | None) -> int | None:
     )
 
 
-def _format(file: Path) -> tuple[tuple[int, int], np.dtype[Any] | None]:
+def format_of(file: Path) -> tuple[tuple[int, int], np.dtype[Any] | None]:
     """Rows, columns and dtype of the frames of a file; no dtype of frames averaged before."""
     saved = saved_shape(file)
     if saved is not None:

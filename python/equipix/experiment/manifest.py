@@ -550,8 +550,13 @@ KEYS = frozenset(
 
 def read_manifest(path: Path, model: type[_Content]) -> _Content:
     """Read and check the experiment.toml, levels.toml or camera.toml `path`."""
+    return checked_content(path, _content(path, model), model)
+
+
+def _content(path: Path, model: type[Table]) -> dict[str, Any]:
+    """Read the tables of a file."""
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise FileError(f"{path}: {unreadable(path, error)}, expected {_called(model)}") from error
     except UnicodeDecodeError as error:
@@ -561,7 +566,24 @@ def read_manifest(path: Path, model: type[_Content]) -> _Content:
         raise FileError(f"{path}: line {line} is no UTF-8: save it as UTF-8, as TOML is") from None
     except tomllib.TOMLDecodeError as error:
         raise FileError(f"{path}: is not valid TOML: {error}") from error
-    return checked_content(path, content, model)
+
+
+def kind_of(path: Path) -> Literal["experiment", "levels", "camera"]:
+    """Say which of the manifests `path` is, by its tables.
+
+    Raises
+    ------
+    FileError
+        If it cannot be read, or is none.
+    """
+    if path.is_dir() or path.suffix.lower() != ".toml":
+        return "camera"
+    content = _content(path, WholeFile)
+    if "level" in content:
+        return "levels"
+    exposures = content.get("exposure")
+    of_camera = [each for each in exposures or [] if {"photons", "irradiance_uw_cm2"} & set(each)]
+    return "camera" if of_camera or {"light", "spatial"} & set(content) else "experiment"
 
 
 def unreadable(path: Path, error: OSError) -> str:

@@ -69,6 +69,8 @@ class Table(NamedTuple):
     head: tuple[str, ...]
     rows: Sequence[tuple[str, ...]]
     caption: str = ""
+    links: Sequence[str] = ()
+    """A file behind the first word of each row, or nothing."""
 
 
 class Part(NamedTuple):

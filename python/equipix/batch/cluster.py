@@ -1,0 +1,159 @@
+"""Tasks on the workers of dask.distributed, each when the memory for it is free."""
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+from equipix.batch.evaluation import Job, Row
+from equipix.errors import EquipixError
+
+_MEMORY = "equipix-memory"
+"""The resource of dask that workers have as many of as bytes."""
+
+_SHARE = 0.9
+"""Share of a machine's free memory that its workers may take."""
+
+_ROUNDS = 4
+"""Times that sensors are sent, if the scheduler ends meanwhile."""
+
+_TIMEOUT_S = 30
+
+
+class Task(NamedTuple):
+    """A job, and the bytes that it needs at the peak."""
+
+    job: Job
+    memory: int
+
+
+def finished(
+    work: Callable[[Job, int | None], Row],
+    tasks: list[Task],
+    scheduler: str | None,
+    workers: int | None,
+) -> Iterator[tuple[Task, Row | str]]:
+    """Each task with its row, or with the reason why there is none, as workers finish them."""
+    left = {task.job.name: task for task in sorted(tasks, key=lambda task: -task.memory)}
+    for _ in range(_ROUNDS):
+        if not left:
+            return
+        with _client(scheduler, [*left.values()], workers) as client:
+            for task, found in _round(client, work, [*left.values()]):
+                del left[task.job.name]
+                yield task, found
+    for task in left.values():
+        yield task, f"the scheduler ended {_ROUNDS} times"
+
+
+def _round(
+    client: Any, work: Callable[[Job, int | None], Row], tasks: list[Task]
+) -> Iterator[tuple[Task, Row | str]]:
+    """Tasks that are finished until the scheduler ends."""
+    from distributed import as_completed
+
+    _wait(client)
+    largest = _largest(client)
+    sent: dict[Any, Task] = {}
+    for task in tasks:
+        if task.memory > largest:
+            yield (
+                task,
+                f"needs {task.memory / 1e9:.1f} GB, and the largest worker has "
+                f"{largest / 1e9:.1f} GB: give a worker more memory, or bin the frames",
+            )
+        else:
+            future = client.submit(
+                _on_worker, work, task.job, pure=False, resources={_MEMORY: task.memory}
+            )
+            sent[future] = task
+    for future in as_completed(sent):
+        if future.status == "finished":
+            yield sent[future], future.result()
+        elif future.status == "error":
+            yield sent[future], _in_words(future.exception())
+        else:  # lost with the scheduler; the next round keeps what is written whole
+            return
+
+
+def _in_words(error: BaseException) -> str:
+    """Why a worker gave no row."""
+    from distributed import KilledWorker
+
+    if isinstance(error, KilledWorker):
+        return "the processes that worked on it ended again and again, perhaps for lack of memory"
+    return f"the worker could not begin: {type(error).__name__}: {error}"
+
+
+def _wait(client: Any) -> None:
+    """Wait until there is a worker."""
+    try:
+        client.wait_for_workers(1, timeout=_TIMEOUT_S)
+    except TimeoutError as error:
+        raise EquipixError(
+            f"no worker came within {_TIMEOUT_S} s: start one with 'dask worker ADDRESS "
+            f"--resources {_MEMORY}=BYTES'"
+        ) from error
+
+
+def _on_worker(work: Callable[[Job, int | None], Row], job: Job) -> Row:
+    """Do the work with as many threads as the worker has."""
+    from distributed import get_worker
+
+    return work(job, get_worker().state.nthreads)
+
+
+@contextmanager
+def _client(scheduler: str | None, tasks: list[Task], workers: int | None) -> Iterator[Any]:
+    """A client of the scheduler, or of a cluster on this machine that ends with it."""
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        raise EquipixError(
+            "a batch needs dask.distributed, which is not installed: pip install 'equipix[batch]'"
+        ) from error
+    if scheduler is not None:
+        try:
+            client = Client(scheduler, timeout=f"{_TIMEOUT_S}s")
+        except (OSError, ValueError) as error:
+            raise EquipixError(
+                f"the scheduler '{scheduler}' cannot be reached ({error}): name it as "
+                "tcp://HOST:PORT, and see that it runs"
+            ) from error
+        with client:
+            yield client
+        return
+    processors, free = len(os.sched_getaffinity(0)), _free_memory()
+    fitting = [task.memory for task in tasks if task.memory <= free] or [free]
+    count = workers or max(1, min(processors, len(tasks), free // max(fitting)))
+    cluster = LocalCluster(
+        n_workers=count,
+        threads_per_worker=max(1, processors // count),
+        processes=True,
+        memory_limit=0,
+        dashboard_address="127.0.0.1:0",
+        resources={_MEMORY: free // count},
+    )
+    with cluster, Client(cluster) as client:
+        yield client
+
+
+def _free_memory() -> int:
+    """Bytes that the workers of this machine may take."""
+    import psutil
+    from distributed.system import MEMORY_LIMIT  # of the machine or its control groups
+
+    return int(_SHARE * min(psutil.virtual_memory().available, MEMORY_LIMIT))
+
+
+def _largest(client: Any) -> int:
+    """Bytes of the largest worker."""
+    workers = client.scheduler_info(n_workers=-1)["workers"].values()
+    declared = [int(each["resources"].get(_MEMORY, 0)) for each in workers]
+    if not any(declared):
+        # A worker that a nanny starts again has what it was started with, and nothing else.
+        raise EquipixError(
+            f"no worker declares its memory: start each with 'dask worker ADDRESS --resources "
+            f"{_MEMORY}=BYTES', such as {_MEMORY}=16e9"
+        )
+    return max(declared)

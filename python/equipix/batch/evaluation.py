@@ -1,0 +1,246 @@
+"""What a worker does with one manifest: result, page and row are written whole, the row last."""
+
+import hashlib
+import json
+import platform
+import time
+import warnings
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from inspect import signature
+from itertools import chain
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from equipix._check import LOG
+from equipix._native import __version__
+from equipix.calibration.result import Calibration, refuse_partial
+from equipix.errors import EquipixError, EquipixWarning
+from equipix.experiment.camera import CameraExperiment
+from equipix.experiment.experiment import Experiment
+from equipix.experiment.image_files import sha256_of
+from equipix.experiment.level_experiment import LevelExperiment
+from equipix.experiment.manifest import kind_of
+from equipix.findings import Finding, usable
+from equipix.io.paths import write_whole
+from equipix.report.camera import camera_checks, camera_parts, figures_of
+from equipix.report.figures import summary
+from equipix.report.limits import Check, LimitsFile, in_json, verdict_of
+from equipix.report.page import page, part_of, write_page
+
+Described = Experiment | LevelExperiment | CameraExperiment
+
+_PLACES = 48
+"""Most rows and columns of the map of flagged pixels that a row holds."""
+
+
+class Job(NamedTuple):
+    """One manifest, and what is to be made of it."""
+
+    name: str
+    manifest: Path
+    output: Path
+    suffix: str
+    options: Mapping[str, Any]
+    limits: LimitsFile
+    partial: bool
+
+    def path(self, suffix: str) -> Path:
+        """A file of this sensor."""
+        return self.output / f"{self.name}{suffix}"
+
+
+@dataclass(frozen=True)
+class Row:
+    """What is known of one sensor of a lot.
+
+    Attributes
+    ----------
+    sensor, manifest : str
+        Its name in the lot, and the file that describes it.
+    status : {"done", "kept", "failed"}
+        Whether it was evaluated now, had been before, or gave no result.
+    reason : str
+        Why it failed.
+    verdict : str
+        PASS or FAIL; nothing where nothing is judged.
+    limits : list of dict
+        Each figure that is judged, with its limit.
+    findings : list of dict
+        Kind, severity and message of each.
+    figures : dict
+        Main figures of the result.
+    flagged : list of list of float
+        Share of flagged pixels in parts of the sensor, 48 at most along each axis.
+    result, report : str
+        Names of the files in the output folder.
+    key : str
+        Hash of inputs, options, limits and version.
+    seconds : float
+        How long it took.
+    host : str
+        The machine that did it.
+    """
+
+    sensor: str
+    manifest: str
+    status: str = "failed"
+    reason: str = ""
+    verdict: str = ""
+    limits: list[dict[str, str]] = field(default_factory=list)
+    findings: list[dict[str, str]] = field(default_factory=list)
+    figures: dict[str, Any] = field(default_factory=dict)
+    flagged: list[list[float]] = field(default_factory=list)
+    result: str = ""
+    report: str = ""
+    key: str = ""
+    seconds: float = 0.0
+    host: str = ""
+
+
+def described_by(manifest: Path) -> Described:
+    """Read a manifest of any kind."""
+    kinds: dict[str, type[Described]] = {
+        "experiment": Experiment,
+        "levels": LevelExperiment,
+        "camera": CameraExperiment,
+    }
+    return kinds[kind_of(manifest)].load(manifest)
+
+
+def evaluate(job: Job, workers: int | None = None) -> Row:
+    """Evaluate a manifest, unless that was done; what stands in the way is the row's reason."""
+    started = time.monotonic()
+    row = Row(job.name, str(job.manifest), host=platform.node())
+    try:
+        described = described_by(job.manifest)
+        key = key_of(job, described)
+        before = _kept(job, key)
+        if before is not None:
+            return before
+        found = replace(_evaluated(job, described, workers), key=key, host=row.host)
+        found = replace(found, seconds=time.monotonic() - started)
+        _write(job, found)
+    except EquipixError as error:
+        return replace(row, reason=str(error), seconds=time.monotonic() - started)
+    except Exception as error:
+        # One sensor must not stop the others, whatever is wrong with it.
+        LOG.exception("%s failed", job.name)
+        words = f"{type(error).__name__}: {error}"
+        return replace(row, reason=words, seconds=time.monotonic() - started)
+    return found
+
+
+def key_of(job: Job, described: Described) -> str:
+    """Hash of all that the result depends on; the place of the files is not part of it."""
+    folder = job.manifest.parent
+    hashes = sha256_of([job.manifest, *described.files()])
+    inputs = {
+        str(file.relative_to(folder) if file.is_relative_to(folder) else file): each
+        for file, each in hashes.items()
+    }
+    known = {
+        "version": __version__,
+        "inputs": inputs,
+        "options": dict(job.options),
+        "partial": job.partial,
+        "limits": job.limits.model_dump(),
+        "suffix": job.suffix,
+    }
+    return hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()
+
+
+def kept(job: Job, described: Described) -> Row | None:
+    """The row of before, if nothing has changed since."""
+    return _kept(job, key_of(job, described)) if job.path(".json").exists() else None
+
+
+def _kept(job: Job, key: str) -> Row | None:
+    """The row of before, if all that it names is there and of the same key."""
+    try:
+        row = Row(**json.loads(job.path(".json").read_text()))
+    except (OSError, ValueError, TypeError):
+        return None
+    files = [job.output / name for name in (row.result, row.report) if name]
+    if row.key != key or not all(file.is_file() for file in files):
+        return None
+    return replace(row, manifest=str(job.manifest), status="kept")
+
+
+def _write(job: Job, row: Row) -> None:
+    """Write the row, when all that it names is written."""
+    with write_whole(job.path(".json"), force=True) as temporary:
+        temporary.write_text(json.dumps(asdict(row), indent=1))
+
+
+def _evaluated(job: Job, described: Described, workers: int | None) -> Row:
+    """Evaluate a manifest and write its result and its page."""
+    with warnings.catch_warnings():
+        # The row holds them as findings.
+        warnings.simplefilter("ignore", EquipixWarning)
+        if isinstance(described, CameraExperiment):
+            return _camera(job, described, workers)
+        known = signature(described.run).parameters
+        options = {name: value for name, value in job.options.items() if name in known}
+        result = described.run(workers=workers, **options)
+    output, report = job.path(job.suffix), job.path(".html")
+    if isinstance(result, Calibration) and not job.partial:
+        refuse_partial(result, output)
+    result.save(output, force=True)
+    part = part_of(job.name, result, job.limits)
+    write_page(report, page([part], job.name), force=True)
+    size = "{}×{}".format(*result.shape)
+    row = _row(job, part.checks, result.findings, {"size": size, **summary(result)})
+    return replace(row, result=output.name, flagged=_flagged(~usable(result.flags)))
+
+
+def _camera(job: Job, camera: CameraExperiment, workers: int | None) -> Row:
+    """Evaluate a camera; its figures are its result."""
+    planes = camera.figures(workers=workers)
+    judged = [camera_checks(found, job.limits.camera) for found in planes.values()]
+    parts = camera_parts(job.name, planes, judged)
+    write_page(job.path(".html"), page(parts, job.name), force=True)
+    figures = {
+        f"{name}.{each.key}" if name else each.key: each.value
+        for name, found in planes.items()
+        for each in figures_of(found)
+    }
+    findings = tuple(dict.fromkeys(each for found in planes.values() for each in found.findings))
+    return _row(job, [*chain.from_iterable(judged)], findings, figures)
+
+
+def _row(
+    job: Job, checks: list[Check], findings: tuple[Finding, ...], figures: Mapping[str, Any]
+) -> Row:
+    """What is found of a sensor."""
+    numbers = {
+        # The table has a column of names of its own.
+        "sensor_name" if name == "sensor" else name: (
+            None if isinstance(value, float) and not np.isfinite(value) else value
+        )
+        for name, value in figures.items()
+        if isinstance(value, bool | int | float | str)
+    }
+    return Row(
+        sensor=job.name,
+        manifest=str(job.manifest),
+        status="done",
+        verdict=verdict_of(checks),
+        limits=in_json(checks),
+        findings=[
+            {"kind": each.kind, "severity": each.severity, "message": each.message}
+            for each in findings
+        ],
+        figures=numbers,
+        report=job.path(".html").name,
+    )
+
+
+def _flagged(flagged: np.ndarray[Any, Any]) -> list[list[float]]:
+    """Share of flagged pixels in parts of the sensor."""
+    rows, cols = (np.linspace(0, n, min(n, _PLACES) + 1).astype(int) for n in flagged.shape)
+    sums = np.add.reduceat(np.add.reduceat(flagged, rows[:-1], 0, int), cols[:-1], 1)
+    shares = sums / np.outer(np.diff(rows), np.diff(cols))
+    return [[round(float(share), 6) for share in row] for row in shares]

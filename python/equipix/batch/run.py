@@ -1,0 +1,155 @@
+"""All manifests of a lot, on the workers of a cluster."""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from inspect import signature
+from itertools import chain
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from equipix._check import LOG, Progress
+from equipix.batch.cluster import Task, finished
+from equipix.batch.evaluation import Job, Row, described_by, evaluate, kept
+from equipix.batch.lot import Lot
+from equipix.batch.memory import bytes_needed
+from equipix.errors import EquipixError, FileError, InputError
+from equipix.experiment.experiment import Experiment
+from equipix.experiment.level_experiment import LevelExperiment
+from equipix.io.formats import SUFFIXES
+from equipix.io.paths import as_path, check_suffix
+from equipix.report.limits import read_limits
+
+_OPTIONS = set(
+    chain(signature(Experiment.run).parameters, signature(LevelExperiment.run).parameters)
+) - {"self", "mask", "workers", "progress"}
+
+
+def run(
+    manifests: Iterable[str | PathLike[str]],
+    output: str | PathLike[str],
+    *,
+    scheduler: str | None = None,
+    limits: str | PathLike[str] | None = None,
+    suffix: str = ".tif",
+    partial: bool = False,
+    workers: int | None = None,
+    progress: Progress | None = None,
+    **options: Any,
+) -> Lot:
+    """Evaluate many manifests, each on one worker of a cluster.
+
+    Parameters
+    ----------
+    manifests : iterable of path
+        Each an experiment.toml, levels.toml or camera.toml. All workers must see them, and their
+        files, under the same names.
+    output : path
+        Folder of the results, made where it is not there. All workers must see it.
+    scheduler : str, optional
+        Address of a scheduler of dask.distributed, such as ``tcp://host:8786``. Unless given, as
+        many worker processes run on this machine as processors and memory allow.
+    limits : path, optional
+        A limits.toml, by which each result is judged.
+    suffix : str
+        Format of the results, as in ``save``.
+    partial : bool
+        Whether to write calibrations that determine less than half of the pixels; they have failed
+        unless it is set.
+    workers : int, optional
+        Number of worker processes on this machine.
+    progress : callable, optional
+        Called as ``progress(done, total, stage)`` repeatedly.
+    **options
+        Keywords of `Experiment.run` and `LevelExperiment.run`; each goes to the manifests of its
+        kind.
+
+    Returns
+    -------
+    Lot
+        A row for each manifest, also for those that failed.
+
+    Raises
+    ------
+    InputError
+        If an option is unknown, a manifest is named twice, or `suffix` is no format.
+    FileError
+        If `output` or `limits` cannot be used.
+    EquipixError
+        If dask.distributed is not installed, or the scheduler cannot be reached.
+
+    Notes
+    -----
+    The name of a sensor is the folder of its manifest, with the name of the file where several are
+    in one folder. A worker writes the result, then a page, then ``NAME.json``, each whole or not
+    at all. A sensor whose JSON file has the hash of its inputs, options, limits and version is
+    kept as it is: a lot that was interrupted goes on where it was. Nothing but rows travels through
+    the scheduler. A worker takes a sensor when the memory for it is free, so that large ones go one
+    at a time.
+    """
+    if unknown := sorted(set(options) - _OPTIONS):
+        known = ", ".join(sorted(_OPTIONS))
+        raise InputError(f"'{unknown[0]}' is no option of a manifest, expected one of {known}")
+    check_suffix(Path(f"result{suffix}"), SUFFIXES)
+    wanted = read_limits(None if limits is None else as_path("limits", limits))
+    folder = as_path("output", output)
+    jobs = [
+        Job(name, manifest, folder, suffix, options, wanted, partial)
+        for name, manifest in _named([as_path("manifests", each) for each in manifests]).items()
+    ]
+    _refuse_as_output(folder)
+    found: dict[str, Row] = {}
+    for row in _rows(jobs, scheduler, workers, progress):
+        found[row.sensor] = row
+        LOG.info("%s: %s", row.sensor, row.reason or row.status)
+    lot = Lot(tuple(found[job.name] for job in jobs))
+    lot.save(folder)
+    return lot
+
+
+def _named(manifests: list[Path]) -> dict[str, Path]:
+    """Manifests by short names: that of the folder, with that of the file where needed."""
+    files = [file.resolve() for file in manifests]
+    if not files:
+        raise InputError("'manifests' is empty: name the experiment.toml of each sensor")
+    if twice := [str(file) for file, count in Counter(files).items() if count > 1]:
+        raise InputError(f"'{twice[0]}' is named twice: name each manifest once")
+    for parts in range(1, max(len(file.parts) for file in files)):
+        for own in (False, True):
+            names = ["-".join([*file.parent.parts[-parts:], *[file.stem] * own]) for file in files]
+            if len(set(names)) == len(files):
+                return dict(sorted(zip(names, files, strict=True)))
+    raise InputError("two manifests differ by the letter / alone: rename a folder")
+
+
+def _refuse_as_output(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"'{folder}' cannot be the folder of results: {error.strerror}") from error
+
+
+def _rows(
+    jobs: list[Job], scheduler: str | None, workers: int | None, progress: Progress | None
+) -> Iterator[Row]:
+    """The row of each job, as workers finish them."""
+    tasks, done = [], 0
+    for job in jobs:
+        try:
+            described = described_by(job.manifest)
+            # Workers of a cluster look for themselves: they hash inputs side by side.
+            before = kept(job, described) if scheduler is None else None
+            if before is not None:
+                done += 1
+                yield before
+            else:
+                tasks.append(Task(job, bytes_needed(described, job.options)))
+        except EquipixError as error:
+            done += 1
+            yield Row(job.name, str(job.manifest), reason=str(error))
+    for task, found in finished(evaluate, tasks, scheduler, workers):
+        done += 1
+        if progress is not None:
+            progress(done, len(jobs), "sensors")
+        job = task.job
+        yield found if isinstance(found, Row) else Row(job.name, str(job.manifest), reason=found)

@@ -1,0 +1,446 @@
+"""Lots of sensors on a cluster of two processes: rows, files, what is kept, what faults leave."""
+
+import csv
+import functools
+import json
+import os
+import pkgutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+import equipix
+from equipix import batch, errors, simulate
+from equipix.batch.cluster import Task, finished
+from equipix.batch.evaluation import Job, Row, described_by, evaluate
+from equipix.io.tiff import write_frames
+from equipix.report.limits import LimitsFile, limits_template
+from given import written_experiment
+
+TIMES = {"started", "finished", "created", "seconds"}
+
+SHIFTS = [(0, 0), (0, 5), (0, 9), (5, 0), (9, 0)]
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """Two worker processes of one thread each."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        dashboard_address="127.0.0.1:0",
+        memory_limit=0,
+        resources={"equipix-memory": 2e9},
+    ) as cluster:
+        yield cluster
+
+
+def write_levels(folder):
+    """Write three levels of a uniform source."""
+    rng, lines = np.random.default_rng(5), []
+    folder.mkdir()
+    for number in range(3):
+        frames = np.rint(rng.normal(300 + 900 * number, 8, (4, 40, 50))).astype(np.uint16)
+        write_frames(folder / f"{number}.tif", frames, nbytes=frames.nbytes)
+        lines.append(f'[[level]]\nframes = "{number}.tif"')
+    (folder / "levels.toml").write_text("[sensor]\nbit_depth = 12\n" + "\n".join(lines))
+    return folder / "levels.toml"
+
+
+@pytest.fixture
+def lot(tmp_path):
+    """Two experiments and one of levels."""
+    manifests = []
+    for name, shape in (("a", (90, 110)), ("b", (80, 120))):
+        manifests.append(written_experiment(tmp_path / name, shape, SHIFTS))
+    (tmp_path / "lot").mkdir()
+    return [*manifests, write_levels(tmp_path / "lot" / "levels")]
+
+
+def run(lot, tmp_path, cluster, **options):
+    return batch.run(lot, tmp_path / "results", scheduler=cluster.scheduler_address, **options)
+
+
+@pytest.mark.long
+def test_each_sensor_has_a_result_a_page_and_a_row(lot, tmp_path, cluster):
+    (tmp_path / "limits.toml").write_text(limits_template())
+    found = run(lot, tmp_path, cluster, limits=tmp_path / "limits.toml", order=0)
+    assert [row.sensor for row in found.rows] == ["a-experiment", "b-experiment", "lot-levels"]
+    assert [row.status for row in found.rows] == ["done"] * 3
+    for row in found.rows:
+        assert (tmp_path / "results" / row.report).read_text().startswith("<!doctype html>")
+        assert equipix.load(tmp_path / "results" / row.result).shape
+        written = json.loads((tmp_path / "results" / f"{row.sensor}.json").read_text())
+        assert Row(**written) == row
+    columns = found.columns
+    with (tmp_path / "results" / "lot.csv").open(newline="") as file:
+        rows = [*csv.DictReader(file)]
+    assert [row["sensor"] for row in rows] == columns["sensor"]
+    assert [float(row["reduced_chi2"]) for row in rows[:2]] == columns["reduced_chi2"][:2]
+    parquet = pytest.importorskip("pyarrow.parquet")
+    assert parquet.read_table(tmp_path / "results" / "lot.parquet").to_pydict() == columns
+    good, of = found.yields["converged"]
+    assert (good, of) == (2, 2)
+    page = (tmp_path / "results" / "lot.html").read_text()
+    assert f'<a href="{found.rows[0].report}">' in page
+
+
+@pytest.mark.long
+def test_results_are_those_of_one_process(lot, tmp_path, cluster):
+    """The same bytes of every array and the same metadata, but for times."""
+    found = run(lot, tmp_path, cluster)
+    for manifest, row in zip(lot[:2], found.rows, strict=False):
+        alone = equipix.Experiment.load(manifest).run()
+        alone.save(tmp_path / "alone.tif", force=True)
+        one, other = (
+            equipix.load(file)
+            for file in (tmp_path / "alone.tif", tmp_path / "results" / row.result)
+        )
+        for name in ("sensitivity", "flags", "beam", "shifts", "flux"):
+            assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
+        first, second = (
+            {name: value for name, value in each.metadata.items() if name not in TIMES}
+            for each in (one, other)
+        )
+        assert first == second
+
+
+@pytest.mark.long
+def test_what_is_the_same_is_kept(lot, tmp_path, cluster):
+    first = run(lot, tmp_path, cluster)
+    again = run(lot, tmp_path, cluster)
+    assert [row.status for row in again.rows] == ["kept"] * 3
+    assert [row.key for row in again.rows] == [row.key for row in first.rows]
+    # An option, an input, a lost result.
+    assert [row.status for row in run(lot, tmp_path, cluster, tolerance=1e-5).rows] == ["done"] * 3
+    run(lot, tmp_path, cluster)
+    frames = np.full((4, 40, 50), 700, np.uint16)
+    frames[::2] += 9
+    write_frames(tmp_path / "lot" / "levels" / "0.tif", frames, nbytes=frames.nbytes)
+    (tmp_path / "results" / again.rows[0].result).unlink()
+    states = [row.status for row in run(lot, tmp_path, cluster).rows]
+    assert states == ["done", "kept", "done"]
+
+
+@pytest.mark.long
+def test_one_bad_sensor_does_not_stop_the_others(lot, tmp_path, cluster):
+    next((tmp_path / "a" / "experiment" / "dark").iterdir()).unlink()
+    found = run(lot, tmp_path, cluster)
+    assert [row.status for row in found.rows] == ["failed", "done", "done"]
+    assert "dark" in found.rows[0].reason
+    assert "dark" in (tmp_path / "results" / "lot.html").read_text()
+
+
+@pytest.mark.long
+def test_a_killed_worker_is_replaced(lot, tmp_path, cluster):
+    """SIGKILL to each worker while sensors are evaluated: every one has its result in the end."""
+    from distributed import Client
+
+    with Client(cluster) as client:
+        before = client.run(os.getpid)
+    killer = threading.Timer(2.5, lambda: [os.kill(pid, signal.SIGKILL) for pid in before.values()])
+    killer.start()
+    found = run(lot, tmp_path, cluster)
+    killer.join()
+    assert [row.status for row in found.rows] == ["done"] * 3
+    names = {path.name for path in (tmp_path / "results").iterdir()}
+    wanted = {f"{row.sensor}{end}" for row in found.rows for end in (".json", ".html", ".tif")}
+    assert wanted | {"lot.csv", "lot.parquet", "lot.html"} == names
+    with Client(cluster) as client:
+        client.wait_for_workers(2)
+        assert not set(client.run(os.getpid).values()) & set(before.values())
+
+
+@pytest.mark.long
+def test_a_sensor_waits_for_its_memory(tmp_path):
+    """A worker of two threads takes two small ones at a time, and large ones one by one."""
+    from distributed import LocalCluster
+
+    jobs = [Job(f"{k}", tmp_path, tmp_path, ".tif", {}, LimitsFile(), False) for k in range(4)]
+    one = {
+        "n_workers": 1,
+        "threads_per_worker": 2,
+        "memory_limit": 0,
+        "dashboard_address": "127.0.0.1:0",
+    }
+    one["resources"] = {"equipix-memory": 2e9}
+    with LocalCluster(**one) as cluster:
+        overlaps = {}
+        for memory in (12e8, 5e8):
+            tasks = [Task(job, int(memory)) for job in jobs]
+            rows = [row for _, row in finished(_nap, tasks, cluster.scheduler_address, None)]
+            spans = sorted((row.figures["from"], row.figures["to"]) for row in rows)
+            overlaps[memory] = any(one[1] > other[0] for one, other in pairwise(spans))
+        beyond = [Task(jobs[0], 10**18)]
+        (_, reason), *_ = finished(_nap, beyond, cluster.scheduler_address, None)
+    assert overlaps == {12e8: False, 5e8: True}
+    assert reason.startswith("needs 1000000000.0 GB, and the largest worker has 2.0 GB")
+
+
+def test_without_declared_memory_nothing_is_sent(tmp_path):
+    from distributed import LocalCluster
+
+    tasks = [Task(Job("a", tmp_path, tmp_path, ".tif", {}, LimitsFile(), False), 1)]
+    one = {"n_workers": 1, "processes": False, "dashboard_address": "127.0.0.1:0"}
+    with (
+        LocalCluster(**one) as cluster,
+        pytest.raises(errors.EquipixError, match="--resources equipix-memory=BYTES"),
+    ):
+        next(finished(_nap, tasks, cluster.scheduler_address, None))
+
+
+@pytest.mark.long
+def test_where_all_is_kept_no_cluster_starts(lot, tmp_path, monkeypatch):
+    first = batch.run(lot[2:], tmp_path / "results")
+    assert [row.status for row in first.rows] == ["done"]
+    monkeypatch.setattr("distributed.LocalCluster", None)
+    again = batch.run(lot[2:], tmp_path / "results")
+    assert [row.status for row in again.rows] == ["kept"]
+
+
+def _nap(job, _):
+    began = time.monotonic()
+    time.sleep(0.5)
+    return Row(job.name, "", status="done", figures={"from": began, "to": time.monotonic()})
+
+
+def test_a_full_disk_is_the_reason_and_leaves_nothing_half_written(lot, tmp_path):
+    results = tmp_path / "results"
+    results.mkdir()
+    code = f"""
+import json, resource
+from dataclasses import asdict
+from pathlib import Path
+from equipix.batch.evaluation import Job, evaluate
+from equipix.report.limits import LimitsFile
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+job = Job("a", Path({str(lot[0])!r}), Path({str(results)!r}), ".tif", {{}}, LimitsFile(), False)
+print(json.dumps(asdict(evaluate(job))))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    row = Row(**json.loads(done.stdout))
+    assert row.status == "failed"
+    assert "a.tif: cannot be written" in row.reason
+    assert [*results.iterdir()] == []
+
+
+def test_what_cannot_be_a_lot_is_refused(lot, tmp_path, monkeypatch):
+    output = tmp_path / "results"
+    with pytest.raises(errors.InputError, match="'manifests' is empty"):
+        batch.run([], output)
+    with pytest.raises(errors.InputError, match="is named twice"):
+        batch.run([lot[0], lot[0]], output)
+    with pytest.raises(errors.InputError, match="'toleranz' is no option"):
+        batch.run(lot, output, toleranz=1)
+    with pytest.raises(errors.InputError, match=r"\.doc"):
+        batch.run(lot, output, suffix=".doc")
+    assert not output.exists()
+    monkeypatch.setattr("equipix.batch.cluster._TIMEOUT_S", 1)
+    with pytest.raises(errors.EquipixError, match="cannot be reached"):
+        batch.run(lot, output, scheduler="tcp://127.0.0.1:9")
+
+
+@pytest.mark.long
+def test_the_command_tells_states_and_reasons(lot, tmp_path, run_command, cluster):
+    (tmp_path / "a" / "experiment" / "dark" / "dark.tif").unlink()
+    given = [*lot, "-o", tmp_path / "results", "--scheduler", cluster.scheduler_address]
+    status, out, err = run_command("batch", *given, "--json")
+    told = json.loads(out)
+    assert status == 1
+    assert (told["done"], told["kept"], told["failed"]) == (2, 0, 1)
+    assert "1 of 3 sensors gave no result" in err
+
+
+@pytest.fixture
+def run_command(request):
+    """The fixture `run` of conftest, whose name the helper here has."""
+    return request.getfixturevalue("run")
+
+
+def _kill(seconds, then):
+    """Call `then` and be gone by SIGKILL after some seconds, or when it has ended."""
+
+    def called(*given, **options):
+        threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGKILL)).start()
+        then(*given, **options)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    return called
+
+
+_PHASES = {
+    "average": ("equipix._native.average_files", 0.002),
+    "solve": ("equipix.calibration.calibrate.weighted_fit", 0.02),
+    "write": ("equipix.batch.evaluation.write_page", 0.02),
+    "replace": ("pathlib.Path.replace", 0),
+}
+
+
+def _killed_while(phase, job, workers):
+    """Evaluate; the first attempt ends by SIGKILL in a phase."""
+    mark = job.output.parent / f"{job.name}.{phase}"
+    if not mark.exists():
+        mark.touch()
+        place, seconds = _PHASES[phase]
+        owner, name = pkgutil.resolve_name(place.rpartition(".")[0]), place.rpartition(".")[2]
+        setattr(owner, name, _kill(seconds, getattr(owner, name)))
+    return evaluate(job, workers)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("phase", _PHASES)
+def test_a_worker_killed_in_a_phase_leaves_whole_files(lot, tmp_path, cluster, phase):
+    output = tmp_path / "results"
+    output.mkdir()
+    jobs = [Job(f"{k}", lot[k], output, ".tif", {}, LimitsFile(), False) for k in range(2)]
+    work = functools.partial(_killed_while, phase)
+    found = finished(work, [Task(job, 1) for job in jobs], cluster.scheduler_address, None)
+    assert [row.status for _, row in found] == ["done"] * 2
+    assert (tmp_path / f"0.{phase}").exists()
+    for k in range(2):
+        alone = equipix.Experiment.load(lot[k]).run()
+        there = equipix.load(output / f"{k}.tif")
+        assert there.sensitivity.tobytes() == alone.sensitivity.tobytes()
+        assert Row(**json.loads((output / f"{k}.json").read_text())).status == "done"
+
+
+def _program(*arguments):
+    return subprocess.Popen(
+        [sys.executable, "-m", "distributed.cli." + arguments[0], *arguments[1:]],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+
+
+def _cluster_at(port):
+    """Start a scheduler and a worker; both end with what is returned."""
+    scheduler = _program("dask_scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard")
+    worker = _program(
+        "dask_worker",
+        f"tcp://127.0.0.1:{port}",
+        "--nworkers",
+        "2",
+        "--nthreads",
+        "1",
+        "--no-dashboard",
+        "--resources",
+        "equipix-memory=2e9",
+    )
+    return scheduler, worker
+
+
+def _slow(job, _):
+    time.sleep(3)
+    (job.output / f"{job.name}").touch()
+    return Row(job.name, "", status="done")
+
+
+@pytest.mark.long
+def test_a_scheduler_that_starts_again_gets_the_rest(tmp_path):
+    pytest.importorskip("distributed")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    jobs = [Job(f"{k}", tmp_path, tmp_path, ".tif", {}, LimitsFile(), False) for k in range(6)]
+    programs = [*_cluster_at(port)]
+    try:
+        found = finished(_slow, [Task(job, 1) for job in jobs], f"tcp://127.0.0.1:{port}", None)
+        rows = [next(found)[1]]
+        programs[0].kill()
+        programs[0].wait()
+        programs[1].terminate()
+        programs[1].wait()
+        programs += _cluster_at(port)
+        rows += [row for _, row in found]
+    finally:
+        for each in programs[::-1]:
+            each.terminate()
+            each.wait()
+    assert not [row for row in rows if isinstance(row, str)]
+    assert sorted(row.sensor for row in rows) == [job.name for job in jobs]
+    assert {row.status for row in rows} == {"done"}
+
+
+@pytest.mark.long
+def test_a_disk_that_is_full_is_told_and_the_rest_done_later(lot, tmp_path, cluster):
+    """Disk of 150 kB, later of 50 MB."""
+    output = tmp_path / "results"
+    output.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o"]
+    made = subprocess.run([*mount, "size=150k", "none", output], capture_output=True, check=False)
+    if made.returncode:
+        pytest.skip("mount is not allowed; the test with a limit of file sizes stands in")
+    try:
+        failed = run(lot, tmp_path, cluster).failed
+        assert failed
+        assert all("cannot be written" in row.reason for row in failed)
+        assert not [*output.glob(".*")]
+        for file in output.glob("*.json"):
+            row = Row(**json.loads(file.read_text()))
+            assert equipix.load(output / row.result).shape
+        subprocess.run(["mount", "-o", "remount,size=50m", output], check=True)
+        assert not run(lot, tmp_path, cluster).failed
+    finally:
+        subprocess.run(["umount", output], check=True)
+
+
+def _vanished(job, workers):
+    """Evaluate; the first image goes when the manifest is read."""
+    described = described_by(job.manifest)
+    described.files()[0].unlink()
+    return evaluate(job, workers)
+
+
+@pytest.mark.long
+def test_an_input_that_vanishes_is_the_reason(lot, tmp_path, cluster):
+    output = tmp_path / "results"
+    output.mkdir()
+    jobs = [Job("a", lot[0], output, ".tif", {}, LimitsFile(), False)]
+    ((_, row),) = finished(_vanished, [Task(jobs[0], 1)], cluster.scheduler_address, None)
+    assert row.status == "failed"
+    assert ".tif" in row.reason
+    assert not [*output.iterdir()]
+
+
+_SENSORS = 100
+
+
+@pytest.mark.long
+def test_a_hundred_sensors_end_as_one_after_the_other(tmp_path, cluster):
+    """The same bytes of every array of every result, and the same metadata but for times."""
+    lot = []
+    for number in range(_SENSORS):
+        rng = np.random.default_rng(number)
+        sensitivity = simulate.paper_sensitivity((240, 320), rng=rng)
+        beam = simulate.gaussian_beam((240, 320), width=300)
+        virtual = simulate.experiment(sensitivity, beam, SHIFTS, frames=4, rng=rng)
+        lot.append(virtual.write(tmp_path / f"s{number:03}"))
+    found = run(lot, tmp_path, cluster, suffix=".npz")
+    assert [row.status for row in found.rows] == ["done"] * _SENSORS
+    for manifest, row in zip(lot, found.rows, strict=True):
+        equipix.Experiment.load(manifest).run().save(tmp_path / "alone.npz", force=True)
+        one, other = (
+            np.load(file) for file in (tmp_path / "alone.npz", tmp_path / "results" / row.result)
+        )
+        assert one.files == other.files
+        for name in one.files:
+            if one[name].dtype.kind not in "SU":
+                assert one[name].tobytes() == other[name].tobytes(), name
+        first, second = (
+            {
+                name: value
+                for name, value in equipix.load(file).metadata.items()
+                if name not in TIMES
+            }
+            for file in (tmp_path / "alone.npz", tmp_path / "results" / row.result)
+        )
+        assert first == second
