@@ -54,6 +54,7 @@ def keywords():
 def test_options_that_messages_name_exist():
     """Of any command; messages of a library do not know which command calls it."""
     known = {"--help", "--version", "--install-completion", "--show-completion"}
+    known |= {"--resources"}  # of 'dask worker'
     for name in COMMANDS:
         known |= {option for each in parameters(command(name)) for option in each.opts}
     named = {

@@ -59,10 +59,7 @@ def batch(
     as_json: terminal.Json = False,
     **options: Any,
 ) -> None:
-    """Evaluate many manifests; a table and a page of the lot tell which failed, and why.
-
-    Run again, it keeps what has the same inputs, options and version.
-    """
+    """Evaluate many manifests, on this machine or on a cluster."""
     files = find_files(manifests)
     given = {name: value for name, value in options.items() if value is not None}
     with terminal.working() as (progress, _):
