@@ -23,6 +23,7 @@ from equipix.batch.evaluation import Job, Row, described_by, evaluate
 from equipix.io.tiff import write_frames
 from equipix.report.limits import LimitsFile, limits_template
 from given import written_experiment
+from studies import taken
 
 TIMES = {"started", "finished", "created", "seconds"}
 
@@ -412,20 +413,21 @@ def test_an_input_that_vanishes_is_the_reason(lot, tmp_path, cluster):
 
 
 _SENSORS = 100
+"""Of a whole study."""
 
 
 @pytest.mark.long
-def test_a_hundred_sensors_end_as_one_after_the_other(tmp_path, cluster):
+def test_a_hundred_sensors_end_as_one_after_the_other(tmp_path, cluster, pytestconfig):
     """The same bytes of every array of every result, and the same metadata but for times."""
-    lot = []
-    for number in range(_SENSORS):
+    lot, count = [], taken(_SENSORS, pytestconfig.option.study_share)
+    for number in range(count):
         rng = np.random.default_rng(number)
         sensitivity = simulate.paper_sensitivity((240, 320), rng=rng)
         beam = simulate.gaussian_beam((240, 320), width=300)
         virtual = simulate.experiment(sensitivity, beam, SHIFTS, frames=4, rng=rng)
         lot.append(virtual.write(tmp_path / f"s{number:03}"))
     found = run(lot, tmp_path, cluster, suffix=".npz")
-    assert [row.status for row in found.rows] == ["done"] * _SENSORS
+    assert [row.status for row in found.rows] == ["done"] * count
     for manifest, row in zip(lot, found.rows, strict=True):
         equipix.Experiment.load(manifest).run().save(tmp_path / "alone.npz", force=True)
         one, other = (

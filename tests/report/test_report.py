@@ -20,7 +20,7 @@ import pytest
 from report_results import SHAPE, calibration, every_kind, measured
 
 import equipix
-from equipix import detector, hardware, lens, metrics, nuc, plan, scene, simulate
+from equipix import batch, detector, hardware, lens, metrics, nuc, plan, scene, simulate
 from equipix.errors import FileError
 from equipix.findings import Finding, usable
 from equipix.pictures import new_figure
@@ -784,6 +784,7 @@ def test_short_forms_are_a_line(results, tmp_path):
     (tmp_path / "levels.toml").write_text(
         "".join(f'[[level]]\nframes = "experiment/frames/p{k}.tif"\n' for k in range(2))
     )
+    row = batch.Row("a", "a/experiment.toml", reason="the file is missing")
     shown = [
         *results.values(),
         *(learned(name, SHAPE) for name in METHODS),
@@ -802,6 +803,7 @@ def test_short_forms_are_a_line(results, tmp_path):
         hardware.smallest_widths(line, [raw]),
         *(figures, figures.transfer, equipix.Experiment.load(manifest)),
         equipix.LevelExperiment.load(tmp_path / "levels.toml"),
+        *(equipix.Running(shape), batch.Lot((row,)), row),
     ]
     assert public_classes() <= {type(each) for each in shown}
     for each in shown:

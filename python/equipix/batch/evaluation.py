@@ -29,6 +29,7 @@ from equipix.report.camera import camera_checks, camera_parts, figures_of
 from equipix.report.figures import summary
 from equipix.report.limits import Check, LimitsFile, in_json, verdict_of
 from equipix.report.page import page, part_of, write_page
+from equipix.shown import Brief
 
 Described = Experiment | LevelExperiment | CameraExperiment
 
@@ -53,7 +54,7 @@ class Job(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Row:
+class Row(Brief):
     """What is known of one sensor of a lot.
 
     Attributes
