@@ -75,7 +75,7 @@ def many_row(truth: Array, beam: Array, repetitions: int) -> Row:
             times.append((time.process_time() - start) / len(shifts) / sweeps)
     fewer, many = (float(np.median(each)) for each in found)
     return (
-        f"a core's time an exposure and pass between pixels, {named(cases[0][1])[:-3]}, "
+        f"a core's time an exposure and pass between pixels, {truth.shape[1]}×{truth.shape[0]}, "
         f"{MANY[1]} exposures over {MANY[0]}",
         "<= 1.1 x",
         f"{many / fewer:.2f} x",
