@@ -133,6 +133,8 @@ fn check_saturation<T: Sample>(
 struct Aperture {
     window: Region,
     pixels: Vec<Pixel>,
+    /// Rows and columns of the patch.
+    size: [f64; 2],
     /// Background-subtracted values of the patch.
     signal: Vec<f64>,
     flux: f64,
@@ -143,8 +145,6 @@ struct Aperture {
 struct Pixel {
     /// Place from the window's centre.
     place: [f64; 2],
-    /// The surface's terms at this place, divided by the patch's sizes.
-    terms: Terms,
     inside: bool,
 }
 
@@ -154,20 +154,27 @@ impl Aperture {
         let size = [patch.region.height() as f64, patch.region.width() as f64];
         let pixel = |(row, col): (i64, i64)| {
             let place = [row as f64 - centre[0], col as f64 - centre[1]];
-            let terms = terms([place[0] / size[0], place[1] / size[1]]);
-            Pixel { place, terms, inside: window.contains(row, col) }
+            Pixel { place, inside: window.contains(row, col) }
         };
         let pixels: Vec<Pixel> = patch.region.pixels().map(pixel).collect();
         let outside = pixels.iter().zip(&patch.values).filter(|(pixel, _)| !pixel.inside);
-        let points: Vec<Point> =
-            outside.map(|(pixel, &value)| Point { terms: pixel.terms, value }).collect();
+        let points: Vec<Point> = outside
+            .map(|(pixel, &value)| Point { place: scaled(pixel.place, size), value })
+            .collect();
         let surface = Surface::fit(&points);
-        let above =
-            |(pixel, value): (&Pixel, &f64)| value - dot(&surface.coefficients, &pixel.terms);
+        drop(points);
+        let above = |(pixel, value): (&Pixel, &f64)| {
+            value - dot(&surface.coefficients, &terms(scaled(pixel.place, size)))
+        };
         let signal: Vec<f64> = pixels.iter().zip(&patch.values).map(above).collect();
         let inside = pixels.iter().zip(&signal).filter(|(pixel, _)| pixel.inside);
         let flux = inside.map(|(_, signal)| signal).sum();
-        Self { window, pixels, signal, flux, surface }
+        Self { window, pixels, size, signal, flux, surface }
+    }
+
+    /// The surface's terms at a pixel.
+    fn terms(&self, index: usize) -> Terms {
+        terms(scaled(self.pixels[index].place, self.size))
     }
 
     /// Centroid and standard error along an axis.
@@ -183,12 +190,17 @@ impl Aperture {
         for index in window() {
             let arm = place(index) - offset;
             sum += arm * arm * variance[index];
-            lever.iter_mut().zip(self.pixels[index].terms).for_each(|(h, term)| *h += arm * term);
+            lever.iter_mut().zip(self.terms(index)).for_each(|(h, term)| *h += arm * term);
         }
         let through = solve_by_elimination(&self.surface.normal, lever);
         for (index, _) in ring.zip(&self.surface.kept).filter(|(_, kept)| **kept) {
-            sum += dot(&through, &self.pixels[index].terms).powi(2) * variance[index];
+            sum += dot(&through, &self.terms(index)).powi(2) * variance[index];
         }
         (self.window.centre()[axis] + offset, sum.sqrt() / self.flux)
     }
+}
+
+/// A place in units of the sizes.
+fn scaled(place: [f64; 2], size: [f64; 2]) -> [f64; 2] {
+    [place[0] / size[0], place[1] / size[1]]
 }

@@ -4,7 +4,7 @@ use std::f64::consts::PI;
 
 use super::image::{BLOCKS, Image};
 use super::region::Region;
-use super::surface::{Point, Surface, Terms, along_row, median, robust_deviation, terms};
+use super::surface::{Point, Surface, Terms, along_row, median, robust_deviation};
 use crate::connectivity::{NONE, label_pixels};
 use crate::control::Control;
 use crate::error::{Result, SpotProblem};
@@ -144,7 +144,7 @@ fn background(image: &Image, control: &Control) -> Result<Terms> {
             scaled(block.top, block.bottom, shape.rows),
             scaled(block.left, block.right, shape.cols),
         ];
-        points.push(Point { terms: terms(place), value: median(&mut values) });
+        points.push(Point { place, value: median(&mut values) });
     }
     Ok(Surface::fit(&points).coefficients)
 }

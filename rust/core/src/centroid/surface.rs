@@ -51,10 +51,10 @@ pub(super) fn dot(a: &Terms, b: &Terms) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
-/// A value at the place whose terms are `terms`.
+/// A value at a place.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Point {
-    pub(super) terms: Terms,
+    pub(super) place: [f64; 2],
     pub(super) value: f64,
 }
 
@@ -89,21 +89,23 @@ impl Surface {
     }
 
     fn refine(&mut self, points: &[Point], scratch: &mut [f64]) {
-        let residual = |point: &Point| point.value - dot(&self.coefficients, &point.terms);
+        // Terms are found anew each time: kept, they would take four times the memory of the points.
+        let residual = |point: &Point, terms: &Terms| point.value - dot(&self.coefficients, terms);
         for (slot, point) in scratch.iter_mut().zip(points) {
-            *slot = residual(point).abs();
+            *slot = residual(point, &terms(point.place)).abs();
         }
         let limit = CLIPPING * NORMAL_MAD * median(scratch);
         let mut right = Terms::default();
         self.normal = [Terms::default(); TERMS];
         for (kept, point) in self.kept.iter_mut().zip(points) {
-            let distance = residual(point);
+            let terms = terms(point.place);
+            let distance = residual(point, &terms);
             *kept = distance.abs() <= limit;
             if *kept {
                 for (i, row) in self.normal.iter_mut().enumerate() {
-                    right[i] += point.terms[i] * distance;
-                    for (entry, term) in row.iter_mut().zip(&point.terms) {
-                        *entry += point.terms[i] * term;
+                    right[i] += terms[i] * distance;
+                    for (entry, term) in row.iter_mut().zip(&terms) {
+                        *entry += terms[i] * term;
                     }
                 }
             }
@@ -161,9 +163,9 @@ mod tests {
         let places = |i: usize| [(i / 16) as f64 / 8.0 - 1.0, (i % 16) as f64 / 8.0 - 1.0];
         let points: Vec<Point> = (0..256)
             .map(|i| {
-                let terms = terms(places(i));
                 let spoilt = if (60..145).contains(&i) { 1e4 } else { 0.0 };
-                Point { terms, value: dot(&truth, &terms) + spoilt }
+                let place = places(i);
+                Point { place, value: dot(&truth, &terms(place)) + spoilt }
             })
             .collect();
         let surface = Surface::fit(&points);
