@@ -1,6 +1,6 @@
 """Moves of the sensor, measured from images of a small aperture in the beam."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, Self
@@ -109,19 +109,33 @@ class Equalisation:
 
         A pixel without a dark takes the median, and the centroid corrects it as a bad one.
         """
-        shape = self.darks[0].shape if self.darks else self.gain.shape
-        if frames.shape[-2:] != shape:
+        return self._of_equal_pixels(self._part(frames))
+
+    @property
+    def sensor(self) -> tuple[int, int]:
+        """Rows and columns of the sensor."""
+        rows, cols = self.darks[0].shape if self.darks else self.gain.shape
+        return rows, cols
+
+    def _part(self, frames: Array) -> Array:
+        """Where the maps are."""
+        if frames.shape[-2:] != self.sensor:
             raise InputError(
-                f"'calibration' is of a sensor of {shape}, the images of the aperture "
+                f"'calibration' is of a sensor of {self.sensor}, the images of the aperture "
                 f"have {frames.shape[-2:]} pixels"
             )
-        dark = np.where(np.isnan(self.dark), median(self.dark), self.dark)
-        return np.asarray((frames[..., *self.region] - dark) / self.gain)
+        return frames[..., *self.region]
 
-    def equal(self, raw: Array, level: float | None, hot: Bools | None) -> Array:
-        """Images of equal pixels, whose hot ones are mended."""
+    def _of_equal_pixels(self, part: Array) -> Array:
+        dark = np.where(np.isnan(self.dark), median(self.dark), self.dark)
+        return np.asarray((part - dark) / self.gain)
+
+    def equal(self, raw: Iterable[Array], level: float | None, hot: Bools | None) -> Array:
+        """Images of equal pixels, from some at a time, whose hot ones are mended."""
+        part = np.concatenate([self._part(frames) for frames in raw])
         known = None if hot is None else hot[self.region]
-        return mended(self.apply(raw), hot_places(raw[..., *self.region], level, known))
+        places = hot_places(part, saturation_level(part, level), known)
+        return mended(self._of_equal_pixels(part), places)
 
     def unequal_pixels(self, spot: Spot) -> float:
         """Variance of a centroid by the pixels that are left unequal: s²/4π."""
@@ -223,27 +237,25 @@ def _spots(
     hot: Bools | None,
 ) -> tuple[ShiftMeasurement, tuple[int, int], float]:
     """Find the spots of the move to `exposure`, the shape of the sensor, and a spot's radius."""
-    before, after = (
+    images = (
         raw_frames(entry_files(path, entry, manifest.layout))
         for entry in (exposure.aperture_before, exposure.aperture_after)
         if entry is not None
     )
-    shape = before.shape[-2:]
     level = manifest.sensor.saturation_level
     try:
         if equalisation is None:
+            before, after = (np.concatenate(list(raw)) for raw in images)
             found = measure_shift(before, after, saturation=level, hot=hot)
-            return found, shape, _radius(before[0], found.before)
-        before, after = (
-            equalisation.equal(raw, saturation_level(raw, level), hot) for raw in (before, after)
-        )
+            return found, before.shape[1:], _radius(before[0], found.before)
+        before, after = (equalisation.equal(raw, level, hot) for raw in images)
         # In other units; the first measurement has checked that nothing saturates.
         found = measure_shift(before, after)
         first, second = (
             replace(spot, position=spot.position + equalisation.corner)
             for spot in (found.before, found.after)
         )
-        return replace(found, before=first, after=second), shape, 0.0
+        return replace(found, before=first, after=second), equalisation.sensor, 0.0
     except InputError as error:
         raise type(error)(f"{path}: move to exposure '{exposure.name}': {error}") from error
 

@@ -216,7 +216,7 @@ class Experiment(Described[Manifest]):
         elif self._is_moved():
             shifts, std = self._measured_again(exposures, moves, darks, options)
             exposures = exposures.at(Positions.of(shifts, rotation=positions.rotation, std=std))
-        del darks, colours, moves
+        del darks, hot, colours, moves  # maps of the sensor
         origin |= {"measured_shifts": shifts.tolist(), "measured_shift_std": std.tolist()}
         return calibrated(exposures, options, said=said, provenance=origin)
 

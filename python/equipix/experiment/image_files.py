@@ -3,6 +3,7 @@
 import hashlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -22,7 +23,7 @@ from equipix.experiment.manifest import (
 from equipix.io import binary, camera_raw
 from equipix.io.arrays import split
 from equipix.io.formats import FrameFile, refuse_saved
-from equipix.io.frames import frame_format, read_frames, stream_frames
+from equipix.io.frames import frame_format, stream_frames
 from equipix.io.paths import reading
 from equipix.measured.colour import Colours
 from equipix.measured.statistics import saved_shape
@@ -273,16 +274,18 @@ def _words(one: Path, other: Path) -> str:
     return f"'{one.name}' and '{other.name}' are the same images, and stand"
 
 
-def raw_frames(files: Iterable[Path]) -> Array:
-    """Read frames as the camera gave them, and refuse files that equipix has saved."""
+def raw_frames(files: Sequence[Path]) -> Iterator[Array]:
+    """Frames as the camera gave them, some at a time; files that equipix has saved are refused."""
     for file in files:
         refuse_saved(file)
-    return read_frames(files)
+    return (frames for _, frames in stream_frames(files))
 
 
 def sha256_of(files: Iterable[Path]) -> dict[Path, str]:
     """Hashes of the content of files."""
-    return {file: _sha256(file) for file in files}
+    files = list(files)
+    with ThreadPoolExecutor() as pool:  # hashlib releases the GIL
+        return dict(zip(files, pool.map(_sha256, files), strict=True))
 
 
 def marks_of_levels(hashes: Mapping[Path, str]) -> dict[Path, str]:
