@@ -55,8 +55,7 @@ impl<N: Precision> ConjugateGradients<N> {
     ) -> Result<()> {
         self.sees_large_scales = preconditioner.sees_large_scales();
         // First, since it takes the slope's place.
-        let [_, unit] = system.units::<N>();
-        self.residual = slope.into_iter().map(|slope| N::of(slope / unit)).collect();
+        self.residual = system.slope_in(slope);
         control.check()?;
         let zeros = || system.pass.workers.filled(self.residual.len(), N::default(), control);
         let x = zeros();

@@ -69,28 +69,40 @@ impl Ring {
 
 /// Buffers for a block of pixels.
 pub(super) struct Block {
-    /// l, v and b of each exposure.
-    seen: Vec<[[f32; BLOCK]; 3]>,
+    /// l, v, b and ∂l/∂d of each exposure.
+    seen: Vec<[[f32; BLOCK]; 5]>,
     /// α, M and M².
     pixels: [[f32; BLOCK]; 3],
 }
 
 impl Block {
     pub(super) fn new(exposures: usize) -> Self {
-        Self { seen: vec![[[0.0; BLOCK]; 3]; exposures], pixels: [[0.0; BLOCK]; 3] }
+        Self { seen: vec![[[0.0; BLOCK]; 5]; exposures], pixels: [[0.0; BLOCK]; 3] }
     }
 }
 
-/// What pixels see of the beam and of a change of it, l and v, and what they pull back once M has followed by
-/// −M α: v → b M² (v − l α) with α = i Σ b l v over the exposures of a pixel. Returns the largest size of the change of M
-/// less a share of the change before.
+/// Changes of ln c and d of an exposure, and what its pixels pull at them.
+#[derive(Clone, Copy, Default)]
+pub(super) struct Place {
+    pub(super) changes: [f32; 3],
+    pub(super) pulls: [f64; 3],
+}
+
+/// What pixels see of the beam and of a change of beam, fluxes and shifts, l and v, and what they pull back once M has
+/// followed by −M α: v → b M² (v − l α) with α = i Σ b l v over the exposures of a pixel. Returns the largest size of the
+/// change of M less a share of the change before.
 pub(super) struct Eliminate<'s> {
-    /// Rows of cells as seen along the row of pixels, of the beam and of its change, of which the first tap takes
-    /// number `index`.
-    pub(super) seen: [&'s Ring; 2],
+    /// Rows of cells as seen along the row of pixels, of the beam, of its change and of the beam's slope, of which the
+    /// first tap takes number `index`.
+    pub(super) seen: [&'s Ring; 3],
     pub(super) index: usize,
-    /// Taps along rows of each exposure.
+    /// Taps along rows of each exposure, and their slopes, if shifts are sought.
     pub(super) taps: &'s [[f32; TAPS]],
+    pub(super) slopes: &'s [[f32; TAPS]],
+    /// Fluxes and shifts of each exposure, if any are sought.
+    pub(super) places: &'s mut [Place],
+    /// Columns that pull at nothing.
+    pub(super) few: &'s [usize],
     /// w of each measurement, empty where b is in the taps of an exposure; 1/w₀.
     pub(super) weights: &'s [f64],
     pub(super) per_weight: f64,
@@ -109,7 +121,8 @@ impl pulp::NullaryFnOnce for Eliminate<'_> {
 
     #[inline(always)]
     fn call(self) -> f64 {
-        let Self { seen, index, taps, weights, per_weight, row, unit, share, block, pulls } = self;
+        let Self { seen, index, taps, slopes, places, few, weights, per_weight, .. } = self;
+        let Self { row, unit, share, block, pulls, .. } = self;
         let width = seen[0].width;
         let is_uneven = !weights.is_empty();
         let Block { seen: found, pixels: [along, m, square] } = block;
@@ -121,10 +134,24 @@ impl pulp::NullaryFnOnce for Eliminate<'_> {
             let (first, cols) = (number * BLOCK, last.len());
             let (along, m, square) = (&mut along[..cols], &mut m[..cols], &mut square[..cols]);
             along.fill(0.0);
-            for (k, ([level, value, even], &taps)) in found.iter_mut().zip(taps).enumerate() {
+            for (k, ([level, value, even, down, right], &taps)) in
+                found.iter_mut().zip(taps).enumerate()
+            {
                 let (level, value) = (&mut level[..cols], &mut value[..cols]);
                 combine(taps, seen[0].block(k, index, first, cols), level);
                 combine(taps, seen[1].block(k, index, first, cols), value);
+                if let Some(Place { changes: [log, row, col], .. }) = places.get(k) {
+                    value.iter_mut().zip(&*level).for_each(|(v, l)| *v += log * l);
+                    if let Some(&slopes) = slopes.get(k) {
+                        let (down, right) = (&mut down[..cols], &mut right[..cols]);
+                        combine(slopes, seen[0].block(k, index, first, cols), down);
+                        combine(taps, seen[2].block(k, index, first, cols), right);
+                        let slopes = down.iter().zip(&*right);
+                        for (value, (down, right)) in value.iter_mut().zip(slopes) {
+                            *value += row * down + col * right;
+                        }
+                    }
+                }
                 let both = along.iter_mut().zip(level.iter().zip(&*value));
                 if is_uneven {
                     let weights = &weights[k * width + first..][..cols];
@@ -144,7 +171,10 @@ impl pulp::NullaryFnOnce for Eliminate<'_> {
                 *m = *of_row as f32;
                 *square = *m * *m;
             }
-            for (k, [level, value, even]) in found.iter().enumerate() {
+            few.iter().filter_map(|col| col.checked_sub(first)).for_each(|col| {
+                square.get_mut(col).into_iter().for_each(|square| *square = 0.0);
+            });
+            for (k, [level, value, even, down, right]) in found.iter().enumerate() {
                 let pull = &mut pulls.row_mut(k, index)[AROUND + first..][..cols];
                 let pixels = square.iter().zip(&*along);
                 for ((pull, (square, along)), (level, value)) in
@@ -155,11 +185,31 @@ impl pulp::NullaryFnOnce for Eliminate<'_> {
                 if is_uneven {
                     pull.iter_mut().zip(even).for_each(|(pull, b)| *pull *= b);
                 }
+                if let Some(place) = places.get_mut(k) {
+                    let sought = if slopes.is_empty() { 1 } else { 3 };
+                    for (sum, along) in place.pulls[..sought].iter_mut().zip([level, down, right]) {
+                        *sum += dot(&along[..cols], pull);
+                    }
+                }
             }
             largest = largest.max(follow(last, [m, along], share));
         }
         largest
     }
+}
+
+/// Σ a b.
+#[inline(always)]
+fn dot(a: &[f32], b: &[f32]) -> f64 {
+    let ((a, rest_a), (b, rest_b)) = (a.as_chunks::<LANES>(), b.as_chunks::<LANES>());
+    let mut sums = [0.0_f32; LANES];
+    for (a, b) in a.iter().zip(b) {
+        for lane in 0..LANES {
+            sums[lane] += a[lane] * b[lane];
+        }
+    }
+    let rest = rest_a.iter().zip(rest_b).map(|(a, b)| f64::from(a * b));
+    sums.into_iter().map(f64::from).chain(rest).sum()
 }
 
 /// Takes the changes −M α of pixels in place of the last; returns the largest size less a share of those before.

@@ -22,7 +22,7 @@ use crate::parallel::dot;
 use crate::parallel::{Add, Workers};
 
 /// Rows of pixels in a band, at least.
-const FEWEST_ROWS: usize = 32;
+const FEWEST_ROWS: usize = 64;
 /// Rows of cells that a thread folds at a time.
 const FOLDED: usize = 16;
 
@@ -162,7 +162,7 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
         Ok(total)
     }
 
-    fn no_sums(&self) -> Sums {
+    pub(super) fn no_sums(&self) -> Sums {
         let count = self.exposures.count();
         let moved = if self.with_shifts { count } else { 0 };
         Sums { flux: vec![0.0; count], shifts: vec![[0.0; 2]; moved], ..Sums::default() }

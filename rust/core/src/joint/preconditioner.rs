@@ -139,9 +139,11 @@ impl Preconditioner {
         let (of_cells, of_params) = r.split_at(self.inverse.len());
         debug_assert_eq!(of_params.len(), self.params.len());
         let [inward, outward, energy] = self.scales::<N, T>(system);
+        let of_other = system.unit_of_other_slopes::<N>();
+        let of_params: Vec<f64> = of_params.iter().map(|&r| of_other * r.into()).collect();
         let mut heights = self.wide.gather(of_cells, workers);
         heights.iter_mut().for_each(|height| *height *= inward * energy);
-        heights.extend(of_params.iter().map(|&r| r.into()));
+        heights.extend_from_slice(&of_params);
         self.coarse.correct(&mut heights, DAMPING);
         control.check()?;
         let lines = self.waves.correct(&self.wide, of_cells, [inward, energy], workers);
@@ -171,7 +173,7 @@ impl Preconditioner {
         control.check()?;
         self.rim.add(of_cells, z, system.units::<N>(), workers);
         let params = of_params.iter().zip(&self.params).zip(coarse);
-        z.extend(params.map(|((&r, inverse), height)| N::of(r.into() * inverse + *height)));
+        z.extend(params.map(|((r, inverse), height)| N::of(r * inverse + *height)));
         // A multiple of the beam is no error, nor is what moves all exposures alike; what rounding
         // leaves of them must not grow.
         system.take_scale_out(&mut z[..self.inverse.len()]);

@@ -41,18 +41,27 @@ const FOLLOWED: f64 = 1e-6;
 pub(crate) trait Precision: Value {
     const IS_SINGLE: bool;
 
-    /// What 1 stands for in a step and in a slope, for an ordinary light and an ordinary weight: single
-    /// precision holds no numbers of any size.
+    /// What 1 stands for in a step and in a slope of cells, for an ordinary light and an ordinary weight: single
+    /// precision holds no numbers of any size. In a step of fluxes and shifts it stands for 1, and so in their slope for
+    /// the product of both.
     fn units(light: f64, weight: f64) -> [f64; 2];
 
-    /// [`System::multiply`].
-    fn multiply<T: Real>(
+    /// What a step of cells, of θ and of shifts pulls at the cells, the penalty with them, and what else a pass gathers.
+    fn pull<T: Real>(
         system: &mut System<'_, '_, T>,
-        x: &[Self],
-        product: &mut Vec<Self>,
+        step: Step<'_, Self>,
         share: f64,
+        pull: &mut [Self],
         control: &Control,
-    ) -> Result<f64>;
+    ) -> Result<Sums>;
+}
+
+/// A step of cells, of θ and of shifts as they count.
+#[derive(Clone, Copy)]
+pub(crate) struct Step<'s, N> {
+    cells: &'s [N],
+    theta: &'s [f64],
+    moves: &'s [[f64; 2]],
 }
 
 impl Precision for f64 {
@@ -62,38 +71,18 @@ impl Precision for f64 {
         [1.0; 2]
     }
 
-    fn multiply<T: Real>(
+    fn pull<T: Real>(
         system: &mut System<'_, '_, T>,
-        x: &[Self],
-        product: &mut Vec<Self>,
+        step: Step<'_, Self>,
         share: f64,
+        pull: &mut [Self],
         control: &Control,
-    ) -> Result<f64> {
-        let cells = system.state.beam.len();
-        let params = system.fluxes.columns.len();
-        let moves = system.centred(&x[cells + params..]);
-        product.resize(cells, 0.0);
-        let sums = system.propagate(x, &moves, product, share, control)?;
-        system.append(&sums, product);
+    ) -> Result<Sums> {
+        let sums = system.propagate(step, pull, share, control)?;
         if let Some(penalty) = &system.penalty {
-            let product = &mut product[..cells];
-            penalty.add_product(&x[..cells], &system.scale, product, system.pass.workers);
+            penalty.add_product(step.cells, &system.scale, pull, system.pass.workers);
         }
-        let of_flux = product[cells..].iter_mut().zip(&x[cells..cells + params]);
-        for ((product, x), precision) in of_flux.zip(&system.fluxes.precisions) {
-            *product += system.unit * precision * x;
-        }
-        if let Some(prior) = &system.shift_prior {
-            let pulls = prior.pull(&moves);
-            let of_shifts = product[cells + params..].iter_mut().zip(pulls.as_flattened());
-            of_shifts.for_each(|(product, pull)| *product += system.unit * pull);
-        }
-        if !system.shift_noise.is_empty() {
-            let feigned = system.centred_pulls(system.feigned_pulls(&moves));
-            let of_shifts = product[cells + params..].iter_mut().zip(feigned.as_flattened());
-            of_shifts.for_each(|(product, feigned)| *product -= feigned);
-        }
-        Ok(sums.largest)
+        Ok(sums)
     }
 }
 
@@ -104,20 +93,23 @@ impl Precision for f32 {
         [light, weight * light]
     }
 
-    fn multiply<T: Real>(
+    fn pull<T: Real>(
         system: &mut System<'_, '_, T>,
-        x: &[Self],
-        product: &mut Vec<Self>,
+        step: Step<'_, Self>,
         share: f64,
+        pull: &mut [Self],
         control: &Control,
-    ) -> Result<f64> {
-        let Some(penalty) = &system.penalty else { return Ok(f64::INFINITY) };
+    ) -> Result<Sums> {
+        let Some(penalty) = &system.penalty else {
+            return Ok(Sums { largest: f64::INFINITY, ..system.pass.no_sums() });
+        };
         let fused = system.fused.get_or_insert_with(|| {
             Fused::new(&system.pass, &system.state.beam, system.ordinary, control)
         });
         control.check()?;
-        product.resize(x.len(), 0.0);
-        fused.multiply(&mut system.pass, (penalty, &system.scale), x, share, product, control)
+        let logs = system.fluxes.spread(step.theta);
+        let (penalty, others) = ((penalty, &system.scale[..]), (&logs[..], step.moves));
+        fused.pull(&mut system.pass, penalty, step.cells, others, share, pull, control)
     }
 }
 
@@ -406,15 +398,72 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         share: f64,
         control: &Control,
     ) -> Result<f64> {
-        let largest = N::multiply(self, x, product, share, control)?;
-        self.balance(&mut product[..self.state.beam.len()]);
-        Ok(largest)
+        let (cells, others) = x.split_at(self.state.beam.len());
+        let others: Vec<f64> = others.iter().map(|&x| x.into()).collect();
+        let (theta, shifts) = others.split_at(self.fluxes.columns.len());
+        let moves = self.centred(shifts);
+        product.resize(cells.len(), N::default());
+        let step = Step { cells, theta, moves: &moves };
+        let sums = N::pull(self, step, share, product, control)?;
+        self.balance(product);
+        let mut pulls = Vec::with_capacity(others.len());
+        self.append(&sums, &mut pulls);
+        let (of_flux, of_shifts) = pulls.split_at_mut(theta.len());
+        for ((pull, x), precision) in of_flux.iter_mut().zip(theta).zip(&self.fluxes.precisions) {
+            *pull += self.unit * precision * x;
+        }
+        if let Some(prior) = &self.shift_prior {
+            let pulls = prior.pull(&moves);
+            let of_shifts = of_shifts.iter_mut().zip(pulls.as_flattened());
+            of_shifts.for_each(|(sum, pull)| *sum += self.unit * pull);
+        }
+        if !self.shift_noise.is_empty() {
+            let feigned = self.centred_pulls(self.feigned_pulls(&moves));
+            let of_shifts = of_shifts.iter_mut().zip(feigned.as_flattened());
+            of_shifts.for_each(|(sum, feigned)| *sum -= feigned);
+        }
+        let unit = self.unit_of_other_slopes::<N>();
+        product.extend(pulls.into_iter().map(|pull| N::of(pull / unit)));
+        Ok(sums.largest)
     }
 
-    /// What 1 stands for in a step and in a slope.
+    /// What 1 stands for in a step and in a slope of cells.
     pub(crate) fn units<N: Precision>(&self) -> [f64; 2] {
         let [light, weight] = self.ordinary;
         N::units(light, weight)
+    }
+
+    /// What 1 stands for in a slope of fluxes and shifts.
+    pub(crate) fn unit_of_other_slopes<N: Precision>(&self) -> f64 {
+        self.units::<N>().into_iter().product()
+    }
+
+    /// A slope in numbers of this precision.
+    pub(crate) fn slope_in<N: Precision>(&self, slope: Vec<f64>) -> Vec<N> {
+        let [_, of_cell] = self.units::<N>();
+        self.divided(slope, [of_cell, self.unit_of_other_slopes::<N>()])
+    }
+
+    /// A step in numbers of this precision.
+    pub(crate) fn step_in<N: Precision>(&self, step: Vec<f64>) -> Vec<N> {
+        let [of_cell, _] = self.units::<N>();
+        self.divided(step, [of_cell, 1.0])
+    }
+
+    /// A step whose numbers had another precision.
+    pub(crate) fn step_of<N: Precision>(&self, step: Vec<N>) -> Vec<f64> {
+        let [of_cell, _] = self.units::<N>();
+        let step = step.into_iter().map(Into::into).collect();
+        self.divided(step, [1.0 / of_cell, 1.0])
+    }
+
+    /// Values of cells and others, divided by their units.
+    fn divided<N: Value>(&self, values: Vec<f64>, [of_cell, of_other]: [f64; 2]) -> Vec<N> {
+        let cells = self.state.beam.len();
+        let unit = |index| if index < cells { of_cell } else { of_other };
+        let numbered = values.into_iter().enumerate();
+        // In the place of the values, where numbers have their size.
+        numbered.map(|(index, value)| N::of(value / unit(index))).collect()
     }
 
     /// Whether products can be made in single precision.
@@ -425,15 +474,13 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     /// What a step pulls at the cells once M and O have followed it.
     fn propagate(
         &mut self,
-        x: &[f64],
-        moves: &[[f64; 2]],
+        Step { cells, theta, moves }: Step<'_, f64>,
         pull: &mut [f64],
         share: f64,
         control: &Control,
     ) -> Result<Sums> {
-        let cells = self.state.beam.len();
-        let shares = self.shares(&x[cells..]);
-        let views = self.pass.views_of(&x[..cells]);
+        let shares = self.shares(theta);
+        let views = self.pass.views_of(cells);
         self.pass.run(&self.state.beam, pull, control, |pass, row_index, row, workspace, found| {
             pass.weigh_row(row_index, &mut workspace.weights);
             workspace.begin(&shares, moves);
@@ -446,8 +493,8 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
     }
 
     /// Changes of ln c, divided by c, of changes of θ and what stands behind them.
-    fn shares(&self, x: &[f64]) -> Vec<f64> {
-        let logs = self.fluxes.spread(&x[..self.fluxes.columns.len()]);
+    fn shares(&self, theta: &[f64]) -> Vec<f64> {
+        let logs = self.fluxes.spread(theta);
         logs.iter().zip(&self.pass.flux).map(|(log, flux)| log / flux).collect()
     }
 

@@ -5,7 +5,7 @@ use super::layout::Grid;
 use super::preconditioner::{FROM_RIM, Preconditioner, around};
 use super::rim::{NEAR_OF_TURNED as NEAR, Rim};
 use super::system::System;
-use super::unknowns::State;
+use super::unknowns::{ShiftPrior, State};
 use crate::coarse::DAMPING;
 use crate::control::Control;
 use crate::exposures::{Exposures, Flux, FluxKind, Mask, Measurements, Positions, Variance};
@@ -33,7 +33,7 @@ fn uneven() -> (Vec<f64>, Vec<bool>) {
 /// Calls `visit` with the linear problem of a sensor that is turned every way, and its dense N.
 fn with_turned(visit: impl FnOnce(&System<'_, '_, f64>, &[Vec<f64>])) {
     let (variance, mask) = uneven();
-    with_system(&ROTATIONS, &each(&variance), &Mask::Measurements(&mask), |system| {
+    with_system(&ROTATIONS, &each(&variance), &Mask::Measurements(&mask), false, |system| {
         visit(system, &dense(system, &FLUX, &variance, &mask));
     });
 }
@@ -46,26 +46,32 @@ fn each(variance: &[f64]) -> Variance<'_, f64> {
     Variance::Measurements(stack(variance))
 }
 
-/// Calls `visit` with the linear problem of exposures that are turned so.
+/// Calls `visit` with the linear problem of exposures that are turned so, which seeks fluxes and shifts too if so
+/// wanted.
 fn with_system(
     rotations: &[Rotation; 4],
     variance: &Variance<'_, f64>,
     mask: &Mask<'_>,
+    seeks_more: bool,
     visit: impl FnOnce(&mut System<'_, '_, f64>),
 ) {
     let frames: Vec<f64> =
         (0..ROTATIONS.len() * SENSOR.len()).map(|i| 1.0 + 0.1 * random(i + 5000)).collect();
     let (workers, control) = (Workers::new(None).unwrap(), Control::new());
     let measurements = Measurements { frames: stack(&frames), variance: *variance, mask: *mask };
-    let positions = Positions { shifts: SHIFTS.to_vec(), rotations: rotations.to_vec(), std: None };
-    let lamp = Flux { values: FLUX.to_vec(), kind: FluxKind::Known };
+    let std = seeks_more.then(|| vec![[0.02, 0.05]; SHIFTS.len()]);
+    let positions = Positions { shifts: SHIFTS.to_vec(), rotations: rotations.to_vec(), std };
+    let prior = ShiftPrior::of(&positions);
+    let kind = if seeks_more { FluxKind::Free } else { FluxKind::Known };
+    let lamp = Flux { values: FLUX.to_vec(), kind: kind.clone() };
     let exposures =
         Exposures::new(measurements, positions, lamp, false, &workers, &control).unwrap();
-    let grid = Grid::new(SENSOR, SHIFTS, rotations, false).unwrap();
-    let fluxes = Fluxes::new(&FLUX, &FluxKind::Known, SHIFTS, rotations);
+    let grid = Grid::new(SENSOR, SHIFTS, rotations, seeks_more).unwrap();
+    let fluxes = Fluxes::new(&FLUX, &kind, SHIFTS, rotations);
     let beam = (0..grid.geometry.beam.len()).map(|cell| 1.0 + 0.1 * random(cell + 300)).collect();
-    let state = State { beam, theta: Vec::new(), shifts: SHIFTS.to_vec() };
+    let state = State { beam, theta: vec![0.0; fluxes.columns.len()], shifts: SHIFTS.to_vec() };
     let mut system = System::new(&exposures, grid, fluxes, state, &workers, &control).unwrap();
+    system.seek_shifts(prior);
     system.linearise(&control).unwrap();
     visit(&mut system);
 }
@@ -185,17 +191,28 @@ fn less_is_left_beside_the_rim() {
 #[test]
 fn the_preconditioner_is_symmetric_and_the_same_in_single_precision() {
     let (variance, mask) = uneven();
-    with_system(&[Rotation::None; 4], &each(&variance), &Mask::Measurements(&mask), |system| {
+    for seeks_more in [false, true] {
+        is_symmetric_and_the_same(&variance, &mask, seeks_more);
+    }
+}
+
+fn is_symmetric_and_the_same(variance: &[f64], mask: &[bool], seeks_more: bool) {
+    let (variance, mask) = (each(variance), Mask::Measurements(mask));
+    with_system(&[Rotation::None; 4], &variance, &mask, seeks_more, |system| {
         let control = Control::new();
         let preconditioner = Preconditioner::new(system, &control).unwrap();
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-        // Pulls at no multiple of the beam, as those of measurements.
+        // Pulls at no multiple of the beam, and moves no exposures together, as those of measurements.
         let pulls = |seed: usize| -> Vec<f64> {
-            let cells = 0..system.size();
-            let white: Vec<f64> = cells.map(|cell| random(cell + seed) - 0.5).collect();
-            let multiple = dot(&white, &system.state.beam) / system.ordinary[0];
-            let scale = system.scale.iter();
-            white.iter().zip(scale).map(|(r, scale)| r - multiple * f64::from(*scale)).collect()
+            let mut pulls: Vec<f64> =
+                (0..system.size()).map(|at| random(at + seed) - 0.5).collect();
+            let multiple = dot(&pulls, &system.state.beam) / system.ordinary[0];
+            let cells = pulls.iter_mut().zip(&system.scale);
+            cells.for_each(|(r, scale)| *r -= multiple * f64::from(*scale));
+            let of_shifts = &mut pulls[system.state.beam.len() + system.fluxes.columns.len()..];
+            let centred = system.centred_pulls(of_shifts.as_chunks().0.to_vec());
+            of_shifts.copy_from_slice(centred.as_flattened());
+            pulls
         };
         let (r, s) = (pulls(17), pulls(4711));
         let (mut of_r, mut of_s) = (Vec::new(), Vec::new());
@@ -205,14 +222,16 @@ fn the_preconditioner_is_symmetric_and_the_same_in_single_precision() {
         let rounding = 100.0 * f64::from(f32::EPSILON);
         let size = (dot(&r, &of_r) * dot(&s, &of_s)).sqrt();
         assert!(size > 0.0 && (dot(&r, &of_s) - dot(&s, &of_r)).abs() < rounding * size);
-        let [step, slope] = system.units::<f32>();
-        let short: Vec<f32> = r.iter().map(|r| (r / slope) as f32).collect();
-        let mut single = Vec::new();
-        preconditioner.apply(system, &short, &mut single, &control).unwrap();
+        let mut single: Vec<f32> = Vec::new();
+        preconditioner.apply(system, &system.slope_in(r.clone()), &mut single, &control).unwrap();
+        let single = system.step_of(single);
         let pairs = single.iter().zip(&of_r).zip(&system.weights);
         let square = |off: f64, d: f32| system.ordinary[1] * f64::from(d) * off * off;
-        let off: f64 = pairs.map(|((one, z), d)| square(step * f64::from(*one) - z, *d)).sum();
+        let off: f64 = pairs.map(|((one, z), d)| square(one - z, *d)).sum();
         assert!(off.sqrt() < rounding * dot(&r, &of_r).sqrt(), "{}", off.sqrt());
+        for (one, z) in single.iter().zip(&of_r).skip(system.state.beam.len()) {
+            assert!((one - z).abs() < rounding * z.abs().max(size.sqrt()), "{one} {z}");
+        }
     });
 }
 
@@ -255,13 +274,15 @@ fn the_matrix_of_waves_is_that_of_the_product() {
 fn a_product_in_single_precision_is_that_in_double() {
     let (variance, mask) = uneven();
     let even = (Variance::Exposures(&[1.0, 2.0, 0.5, 3.0]), Mask::None);
-    for (variance, mask) in [(each(&variance), Mask::Measurements(&mask)), even] {
-        with_system(&[Rotation::None; 4], &variance, &mask, |system| {
+    let cases = [(each(&variance), Mask::Measurements(&mask)), even];
+    for ((variance, mask), seeks_more) in
+        cases.iter().flat_map(|case| [(case, false), (case, true)])
+    {
+        with_system(&[Rotation::None; 4], variance, mask, seeks_more, |system| {
             assert!(system.has_single());
             let control = Control::new();
             let x: Vec<f64> = (0..system.size()).map(|cell| random(cell + 31) - 0.5).collect();
-            let [step, slope] = system.units::<f32>();
-            let short: Vec<f32> = x.iter().map(|x| (x / step) as f32).collect();
+            let short: Vec<f32> = system.step_in(x.clone());
             let (mut single, mut double) = (Vec::new(), Vec::new());
             let sizes = [
                 system.multiply(&short, &mut single, 0.5, &control).unwrap(),
@@ -271,10 +292,19 @@ fn a_product_in_single_precision_is_that_in_double() {
             let rounding = 256.0 * f64::from(f32::EPSILON);
             // The change of the first, less half of itself.
             assert!((sizes[1] / sizes[0] - 0.5).abs() < rounding);
-            let size = double.iter().fold(0.0_f64, |top, value| top.max(value.abs()));
-            for (one, other) in single.iter().zip(&double) {
-                let one = slope * f64::from(*one);
-                assert!((one - other).abs() < rounding * size, "{one} {other}");
+            let ([_, of_cell], cells) = (system.units::<f32>(), system.state.beam.len());
+            let (of_cells, of_others) = double.split_at(cells);
+            // Those of fluxes and shifts are sums over all pixels, whose roundings are independent.
+            let found = |unit: f64| move |one: &f32| unit * f64::from(*one);
+            let others = found(system.unit_of_other_slopes::<f32>());
+            for (single, double, found) in [
+                (&single[..cells], of_cells, &found(of_cell) as &dyn Fn(&f32) -> f64),
+                (&single[cells..], of_others, &others),
+            ] {
+                let size = double.iter().fold(0.0_f64, |top, value| top.max(value.abs()));
+                for (one, other) in single.iter().map(found).zip(double) {
+                    assert!((one - other).abs() < rounding * size, "{one} {other}");
+                }
             }
         });
     }

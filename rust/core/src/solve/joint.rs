@@ -199,7 +199,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         }
         let ended = self.ended();
         if ended.is_none() {
-            self.step(search, first, kept, preconditioner, control)?;
+            self.step(search, [first, error], kept, preconditioner, control)?;
         }
         Ok(ended)
     }
@@ -264,13 +264,13 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
     fn step<N: Precision>(
         &mut self,
         mut search: ConjugateGradients<N>,
-        first: f64,
+        [first, error]: [f64; 2],
         slope: Option<Vec<f64>>,
         preconditioner: &Preconditioner,
         control: &Control,
     ) -> Result<()> {
         let least = if N::IS_SINGLE { PRECISION } else { CURVED[0] };
-        let share = if slope.is_some() { BY_SHIFTS } else { first.clamp(least, CURVED[1]) };
+        let share = if slope.is_some() { BY_SHIFTS } else { error.clamp(least, CURVED[1]) };
         let reachable = first * share;
         let (mut least, mut waited) = (first, 0);
         while self.products() + A_LOOK < self.limit && waited < PATIENCE_OF_A_SEARCH {
@@ -288,10 +288,9 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
                 break;
             }
         }
-        let [unit, _] = self.system.units::<N>();
         let (x, known) = search.found();
         self.known = known;
-        let mut step: Vec<f64> = x.into_iter().map(|x| unit * x.into()).collect();
+        let mut step = self.system.step_of(x);
         // A multiple of the beam is no step, but the penalty would see one.
         let cells = self.system.state.beam.len();
         self.system.take_scale_out(&mut step[..cells]);

@@ -34,7 +34,7 @@ impl<'m, 'a, T: Real> Uncertainty<'m, 'a, T> {
     /// [`Error::Cancelled`](crate::Error::Cancelled) if `control` asks to stop, here and below.
     pub fn new(
         exposures: &'m Exposures<'a, T>,
-        solution: &Solution<'_>,
+        solution: &Solution<'m>,
         workers: &'m Workers,
         control: &'m Control,
     ) -> Result<Self> {
@@ -157,7 +157,7 @@ impl Fit {
     /// # Errors
     /// As [`Uncertainty::new`].
     pub fn uncertainty<'m, 'a, T: Real>(
-        &self,
+        &'m self,
         exposures: &'m Exposures<'a, T>,
         workers: &'m Workers,
         control: &'m Control,

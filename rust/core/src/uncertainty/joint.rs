@@ -23,6 +23,9 @@
 //!
 //! The noise of a dark that was subtracted from all exposures is a fourth (`joint_dark.rs`).
 
+use std::cell::OnceCell;
+use std::sync::Arc;
+
 use super::joint_dark::Dark;
 use super::joint_gauge::{Hidden, Tilts, count, form, valid};
 use super::joint_pulls::{add_change, product, pull_of};
@@ -69,7 +72,9 @@ pub(super) struct JointCovariance<'m, 'a, T> {
     /// S⁻¹ b of the last right-hand side b, and b · S⁻¹ b.
     x: Vec<f64>,
     energy: f64,
-    tilts: Tilts,
+    /// What the gauge makes of changes, once it is asked for: five values for each pixel.
+    tilts: OnceCell<Arc<Tilts>>,
+    solution: Solution<'m>,
     /// The shifts that are uncertain though they were not refined.
     considered: Option<ShiftPrior>,
     /// Where M is determined.
@@ -89,7 +94,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
     /// [`Error::Cancelled`](crate::Error::Cancelled), here and below.
     pub(super) fn new(
         exposures: &'m Exposures<'a, T>,
-        solution: &Solution<'_>,
+        solution: &Solution<'m>,
         workers: &'m Workers,
         control: &Control,
     ) -> Result<Self> {
@@ -114,7 +119,8 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             .collect();
         let (valid, scale) = valid(&system, &counted);
         Ok(Self {
-            tilts: Tilts::of(&system, solution, &valid),
+            tilts: OnceCell::new(),
+            solution: solution.clone(),
             system,
             preconditioner,
             known: Known::default(),
@@ -127,6 +133,11 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             dark: None,
             incomplete: 0,
         })
+    }
+
+    fn tilts(&self) -> Arc<Tilts> {
+        let found = || Arc::new(Tilts::of(&self.system, &self.solution, &self.valid));
+        Arc::clone(self.tilts.get_or_init(found))
     }
 
     /// Takes the noise of the dark into account, of these variances. A sought offset takes all of it.
@@ -157,9 +168,10 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
     /// The standard deviation of M by pixel, in units of that of a value of weight 1.
     pub(super) fn error_map(&mut self, control: &Control) -> Result<ErrorMap> {
         self.known = Known::default();
+        let tilts = self.tilts();
         if let Some(dark) = &mut self.dark {
             let propagated: Vec<f64> = dark.propagated().collect();
-            let in_gauge = self.tilts.gauge.diagonal(&propagated);
+            let in_gauge = tilts.gauge.diagonal(&propagated);
             dark.in_gauge = in_gauge.map(|variance| (variance / self.scale) as f32).collect();
         }
         let sensor = self.system.pass.exposures.sensor();
@@ -229,9 +241,10 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         if let Some(dark) = &self.dark {
             own.iter_mut().zip(dark.propagated()).for_each(|(own, propagated)| *own += propagated);
         }
-        let in_gauge = self.tilts.gauge.diagonal(&own).enumerate();
+        let tilts = self.tilts();
+        let in_gauge = tilts.gauge.diagonal(&own).enumerate();
         let variance = in_gauge.map(|(pixel, mut variance)| {
-            if let Some(Hidden { tilts, covariance }) = &self.tilts.hidden {
+            if let Some(Hidden { tilts, covariance }) = &tilts.hidden {
                 variance += form(covariance, [tilts[0][pixel], tilts[1][pixel]]);
             }
             (variance / self.scale) as f32
@@ -264,18 +277,17 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         self.apply_inverse(slope, lack, control)?;
         let x = std::mem::take(&mut self.x);
         if self.system.has_single() {
-            let [unit, _] = self.system.units::<f32>();
-            let short: Vec<f32> = x.iter().map(|x| (x / unit) as f32).collect();
+            let short: Vec<f32> = self.system.step_in(x.clone());
             product(&mut self.system, &short, control)?;
         } else {
             product(&mut self.system, &x, control)?;
         }
         add_change(&self.system, &mut change);
-        let workers = self.system.pass.workers;
-        if let Some(drift) = &self.tilts.drift {
+        let (workers, tilts) = (self.system.pass.workers, self.tilts());
+        if let Some(drift) = &tilts.drift {
             workers.add_multiple(&mut change, x[self.system.state.beam.len()], drift);
         }
-        self.tilts.gauge.apply(&mut change, workers);
+        tilts.gauge.apply(&mut change, workers);
         Ok(change)
     }
 
@@ -315,11 +327,11 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         lack: f64,
         control: &Control,
     ) -> Result<f64> {
-        let workers = self.system.pass.workers;
-        self.tilts.gauge.transpose(&mut gain, workers);
+        let (workers, tilts) = (self.system.pass.workers, self.tilts());
+        tilts.gauge.transpose(&mut gain, workers);
         let none = vec![0.0; gain.len()];
         let mut variance = self.own_of(&gain, &none);
-        if let Some(Hidden { tilts, covariance }) = &self.tilts.hidden {
+        if let Some(Hidden { tilts, covariance }) = &tilts.hidden {
             let heights = [0, 1].map(|axis| workers.dot(&tilts[axis], &gain));
             variance += form(covariance, heights);
         }
@@ -343,7 +355,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         let cells = self.system.state.beam.len();
         let (others, none) = (self.others(), vec![0.0; gain.len()]);
         let mut pull = pull_of(&mut self.system, gain, &none, control)?;
-        if let Some(drift) = &self.tilts.drift {
+        if let Some(drift) = &self.tilts().drift {
             pull[cells] += self.system.pass.workers.dot(drift, gain);
         }
         let seen = if self.considered.is_some() {
@@ -429,10 +441,9 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
     fn search<N: Precision>(&mut self, b: Vec<f64>, lack: f64, control: &Control) -> Result<()> {
         let mut search = ConjugateGradients::<N>::after(self.known.clone());
         let done = self.iterate(&mut search, b, lack, control);
-        let units = self.system.units::<N>();
-        self.energy = units[0] * units[1] * search.energy;
+        self.energy = self.system.unit_of_other_slopes::<N>() * search.energy;
         let (x, known) = search.found();
-        self.x = x.into_iter().map(|x| units[0] * x.into()).collect();
+        self.x = self.system.step_of(x);
         self.known = known;
         done
     }

@@ -30,7 +30,7 @@ impl<T: Real> JointCovariance<'_, '_, T> {
         let mut propagated = Vec::new();
         if let Some(dark) = &self.dark {
             propagated = dark.propagate(draw, self.system.pass.exposures.sensor());
-            self.tilts.gauge.apply(&mut propagated, self.system.pass.workers);
+            self.tilts().gauge.apply(&mut propagated, self.system.pass.workers);
         }
         let unit = self.scale.sqrt();
         sampled.iter_mut().chain(&mut propagated).for_each(|change| *change /= unit);

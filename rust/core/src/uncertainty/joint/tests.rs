@@ -162,7 +162,7 @@ fn the_change_of_a_draw_is_the_transpose_of_the_pull_of_a_functional() {
                 product(&mut covariance.system, &whole, control).unwrap()
             };
             let mut in_gauge = gain.clone();
-            covariance.tilts.gauge.transpose(&mut in_gauge, covariance.system.pass.workers);
+            covariance.tilts().gauge.transpose(&mut in_gauge, covariance.system.pass.workers);
             let (pull, seen) = covariance.pull_of_gain(&in_gauge, control).unwrap();
             let wanted = dot(&pull, &x) + dot(&seen, &wrong);
             let variance = covariance.variance_of_gain(gain.clone(), 1e-4, control).unwrap();
