@@ -124,7 +124,7 @@ def clipping_of(frames: FrameStatistics) -> Clipping | None:
     which contain the pixels that saturate in some frames only.
     """
     raw = _raw_mean(frames)
-    known = raw[(frames.saturated == 0) & np.isfinite(raw)]
+    known = raw[frames.saturated == 0] if frames.saturated.any() else raw
     found = clipping(known, crowded=0.0)
     if found is None:
         return plateau(known)
