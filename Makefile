@@ -10,7 +10,7 @@ STUDIES ?= 0.1
 # five times as long.
 test test-long study: export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test test-long study bench figures docs lint audit build clean
+.PHONY: demo test test-long study fuzz bench figures docs lint audit build clean
 
 # Scripts: that every name and argument that they use is there.
 LOOSELY := --config-file= --check-untyped-defs --explicit-package-bases --ignore-missing-imports \
@@ -32,6 +32,12 @@ test-long: $(BIN)/.built-ci
 study: $(BIN)/.built-ci
 	$(BIN)/python -m pytest -m study -n 2 --dist worksteal --study-share 1 \
 		--study-record=docs/studies.md
+
+# Random files for every reader; FUZZ_INPUTS ends each after so many.
+fuzz: export FUZZ_SECONDS ?= 60
+fuzz: $(BIN)/.built-ci $(BIN)/.installed-fuzz
+	cd fuzz && cargo fmt --check && cargo clippy --locked -- -D warnings
+	$(BIN)/python fuzz/run.py
 
 bench: $(BIN)/.built-release $(BIN)/.installed-bench
 	$(BIN)/python benches/run.py
@@ -69,7 +75,7 @@ lint: $(BIN)/.built-ci docs
 audit:
 	@if command -v cargo-deny; then cargo deny --locked check; \
 	else echo "no cargo-deny: cargo install --locked cargo-deny"; fi
-	@if command -v pip-audit; then pip-audit -r requirements-dev.txt -r requirements-bench.txt; \
+	@if command -v pip-audit; then pip-audit -r requirements-dev.txt -r requirements-bench.txt -r requirements-fuzz.txt; \
 	else echo "no pip-audit: pipx install pip-audit"; fi
 
 $(BIN)/.installed: requirements-dev.txt
@@ -80,6 +86,10 @@ $(BIN)/.installed: requirements-dev.txt
 # What the rivals in benches/peers need, and nothing else does.
 $(BIN)/.installed-bench: $(BIN)/.installed requirements-bench.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-bench.txt
+	touch $@
+
+$(BIN)/.installed-fuzz: $(BIN)/.installed requirements-fuzz.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-fuzz.txt
 	touch $@
 
 # Only one build is installed at a time: that of the target asked for.

@@ -20,6 +20,7 @@ import equipix
 from equipix import batch, errors, simulate
 from equipix.batch.cluster import Task, finished
 from equipix.batch.evaluation import Job, Row, described_by, evaluate
+from equipix.io.formats import checked
 from equipix.io.tiff import write_frames
 from equipix.report.limits import LimitsFile, limits_template
 from given import written_experiment
@@ -79,7 +80,7 @@ def test_each_sensor_has_a_result_a_page_and_a_row(lot, tmp_path, cluster):
     for row in found.rows:
         assert (tmp_path / "results" / row.report).read_text().startswith("<!doctype html>")
         assert equipix.load(tmp_path / "results" / row.result).shape
-        written = json.loads((tmp_path / "results" / f"{row.sensor}.json").read_text())
+        written = checked((tmp_path / "results" / f"{row.sensor}.json").read_text())
         assert Row(**written) == row
     columns = found.columns
     with (tmp_path / "results" / "lot.csv").open(newline="") as file:
@@ -310,7 +311,7 @@ def test_a_worker_killed_in_a_phase_leaves_whole_files(lot, tmp_path, cluster, p
         alone = equipix.Experiment.load(lot[k]).run()
         there = equipix.load(output / f"{k}.tif")
         assert there.sensitivity.tobytes() == alone.sensitivity.tobytes()
-        assert Row(**json.loads((output / f"{k}.json").read_text())).status == "done"
+        assert Row(**checked((output / f"{k}.json").read_text())).status == "done"
 
 
 def _program(*arguments):
@@ -386,7 +387,7 @@ def test_a_disk_that_is_full_is_told_and_the_rest_done_later(lot, tmp_path, clus
         assert all("cannot be written" in row.reason for row in failed)
         assert not [*output.glob(".*")]
         for file in output.glob("*.json"):
-            row = Row(**json.loads(file.read_text()))
+            row = Row(**checked(file.read_text()))
             assert equipix.load(output / row.result).shape
         subprocess.run(["mount", "-o", "remount,size=50m", output], check=True)
         assert not run(lot, tmp_path, cluster).failed

@@ -24,6 +24,7 @@ from equipix.experiment.image_files import sha256_of
 from equipix.experiment.level_experiment import LevelExperiment
 from equipix.experiment.manifest import kind_of
 from equipix.findings import Finding, usable
+from equipix.io.formats import checked, with_checksum
 from equipix.io.paths import write_whole
 from equipix.report.camera import camera_checks, camera_parts, figures_of
 from equipix.report.figures import summary
@@ -161,7 +162,8 @@ def kept(job: Job, described: Described) -> Row | None:
 def _kept(job: Job, key: str) -> Row | None:
     """The row of before, if all that it names is there and of the same key."""
     try:
-        row = Row(**json.loads(job.path(".json").read_text()))
+        content = checked(job.path(".json").read_text())
+        row = Row(**(content or {}))
     except (OSError, ValueError, TypeError):
         return None
     files = [job.output / name for name in (row.result, row.report) if name]
@@ -173,7 +175,7 @@ def _kept(job: Job, key: str) -> Row | None:
 def _write(job: Job, row: Row) -> None:
     """Write the row, when all that it names is written."""
     with write_whole(job.path(".json"), force=True) as temporary:
-        temporary.write_text(json.dumps(asdict(row), indent=1))
+        temporary.write_text(with_checksum(asdict(row)))
 
 
 def _evaluated(job: Job, described: Described, workers: int | None) -> Row:

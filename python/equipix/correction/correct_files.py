@@ -281,7 +281,9 @@ def _write_all(
     with folder_beside(output) as folder:
         for path, files in outputs.items():
             _write(folder / path.name, frames(files), files, dtype, beside)
-        output.mkdir(exist_ok=True)
+        if not output.exists():
+            folder.rename(output)
+            return
         for path in outputs:
             (folder / path.name).replace(path)
 

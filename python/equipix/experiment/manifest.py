@@ -566,6 +566,11 @@ def _content(path: Path, model: type[Table]) -> dict[str, Any]:
         raise FileError(f"{path}: line {line} is no UTF-8: save it as UTF-8, as TOML is") from None
     except tomllib.TOMLDecodeError as error:
         raise FileError(f"{path}: is not valid TOML: {error}") from error
+    except RecursionError:
+        raise FileError(
+            f"{path}: has arrays or tables within one another beyond what Python reads, expected "
+            f"{_called(model)}"
+        ) from None
 
 
 def kind_of(path: Path) -> Literal["experiment", "levels", "camera"]:
@@ -582,7 +587,9 @@ def kind_of(path: Path) -> Literal["experiment", "levels", "camera"]:
     if "level" in content:
         return "levels"
     exposures = content.get("exposure")
-    of_camera = [each for each in exposures or [] if {"photons", "irradiance_uw_cm2"} & set(each)]
+    tables = exposures if isinstance(exposures, list) else []
+    known = (set(each) for each in tables if isinstance(each, dict))
+    of_camera = [each for each in known if {"photons", "irradiance_uw_cm2"} & each]
     return "camera" if of_camera or {"light", "spatial"} & set(content) else "experiment"
 
 

@@ -7,7 +7,7 @@ their array; its exact name stands in the keyword ARRAY.
 import math
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,6 +25,9 @@ READ = (*SUFFIXES, ".fz", ".gz")
 """Suffixes of files of frames; compressed ones are not written."""
 
 _NAME, _TEXT, _MARK = "ARRAY", "EQUIPIX-METADATA", "EQUIPIX"
+
+_FOLLOWING = "NEXTEND"
+"""Keyword of the number of images behind the first, as the Hubble telescope's files have it."""
 
 _OF_VALUES = ("BSCALE", "BZERO", "BLANK", "DATAMIN", "DATAMAX", "CHECKSUM", "DATASUM", "INHERIT")
 """Keywords that say something of the values of an image, and do not hold for others."""
@@ -52,6 +55,13 @@ def _astropy() -> Any:
     except ImportError as error:
         raise missing("FITS", "astropy", "fits") from error
     return fits
+
+
+@contextmanager
+def _opened(path: Path, **options: bool) -> Iterator[Any]:
+    """Open a file, which is closed even where astropy does not know what it holds."""
+    with path.open("rb") as file, _astropy().open(file, **options) as units:
+        yield units
 
 
 def write_pages(
@@ -92,13 +102,12 @@ def ccddata(viewed: Viewed) -> Any:
 
 def read_pages(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
     """Read what `write_pages` wrote: arrays by name, and the text; of other files none."""
-    fits = _astropy()
+    _astropy()  # names what is missing
     from astropy.utils.exceptions import AstropyWarning
 
     with (
         warnings.catch_warnings(action="error", category=AstropyWarning),  # damage is a warning
-        path.open("rb") as file,
-        fits.open(file, memmap=False, checksum=True) as units,
+        _opened(path, memmap=False, checksum=True) as units,
     ):
         if _TEXT not in units:
             return {}, ""
@@ -143,7 +152,7 @@ def header(path: Path) -> Header:
     All images of one shape count, those of a cube one by one. Of a result that was saved, whose
     text says so, images may be of several shapes.
     """
-    with _astropy().open(path) as units:
+    with _opened(path) as units:
         text = units[_TEXT].data.tobytes().decode() if _TEXT in units else ""
         images = _every_image(units) if text else _images(path, units)
         *_, rows, cols = images[0].shape
@@ -162,7 +171,7 @@ def _type(units: Any) -> ImageType:
 
 def stream_frames(path: Path) -> Iterator[NDArray[Any]]:
     """Frames of a file, one at a time, each of shape (1, rows, cols)."""
-    with _astropy().open(path) as units:
+    with _opened(path) as units:
         for unit in _images(path, units):
             *above, rows, cols = unit.shape
             for index in np.ndindex(*above):
@@ -195,23 +204,26 @@ def write_frames(
         ASCII text, stored with each image.
     """
     fits, rest = _astropy(), iter(frames)
-    for file, shape, history in sources:
-        for kept, axes in _heads(file, shape):
-            stream = fits.StreamingHDU(str(path), _head(kept, axes, dtype, mark, history))
-            with closing(stream):
-                for frame in islice(rest, math.prod(axes[:-2])):
-                    # FITS has no unsigned numbers of 16 bits: 0 is stored as -32768.
-                    whole = dtype == np.uint16
-                    stream.write((frame ^ 2**15).view(np.int16) if whole else frame)
+    images = [
+        (axes, _head(kept, axes, dtype, mark, history))
+        for file, shape, history in sources
+        for kept, axes in _heads(file, shape)
+    ]
+    images[0][1][_FOLLOWING] = (len(images) - 1, "images that follow")
+    for axes, head in images:
+        with closing(fits.StreamingHDU(str(path), head)) as stream:
+            for frame in islice(rest, math.prod(axes[:-2])):
+                # FITS has no unsigned numbers of 16 bits: 0 is stored as -32768.
+                whole = dtype == np.uint16
+                stream.write((frame ^ 2**15).view(np.int16) if whole else frame)
 
 
 def _heads(path: Path, shape: tuple[int, int, int]) -> list[tuple[Any, tuple[int, ...]]]:
     """Header and axes of each image that the frames of a file came from."""
-    fits = _astropy()
     if path.suffix.lower() not in READ:
-        return [(fits.Header(), shape if shape[0] > 1 else shape[1:])]
+        return [(_astropy().Header(), shape if shape[0] > 1 else shape[1:])]
     found = []
-    with fits.open(path) as units:
+    with _opened(path) as units:
         for unit in _images(path, units):
             unit.verify("silentfix+ignore")
             kept = unit.header.copy(strip=True)
@@ -233,7 +245,7 @@ def _head(
         head.set(f"NAXIS{number}", size, after=place)
         place = f"NAXIS{number}"
     head.extend(kept, strip=True, unique=True)
-    for name in _OF_VALUES:
+    for name in (*_OF_VALUES, _FOLLOWING):
         head.remove(name, ignore_missing=True)
     if dtype == np.uint16:
         head["BSCALE"], head["BZERO"] = 1, 2**15
@@ -267,6 +279,11 @@ def _images(path: Path, units: Any) -> list[Any]:
         raise FileError(
             f"{path}: holds images of several shapes ({_in_words(images)}), expected one"
         )
+    # Programs that copy headers leave a wrong number in files of others.
+    first = units[0].header
+    missing_images = first.get(_FOLLOWING, 0) - len(units) + 1 if _MARK in first else 0
+    if missing_images > 0:
+        raise FileError(f"{path}: lacks {missing_images} images at its end: is truncated")
     return images
 
 

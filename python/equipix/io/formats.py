@@ -114,7 +114,7 @@ def save_pages(
         If the suffix is unknown.
     """
     write_pages, _ = _format(as_path("path", path))
-    text = json.dumps({**metadata, _CRC: _checksum(metadata)}, separators=_SEPARATORS)
+    text = with_checksum(metadata)
     with write_whole(path, force=force) as temporary:
         write_pages(temporary, pages, text, viewed)
 
@@ -178,6 +178,17 @@ def refuse_copy(path: str | PathLike[str], use: str | None) -> None:
         raise InputError(f"{path}: a NeXus file holds a flat to divide by, expected 'use' flat")
 
 
+def with_checksum(metadata: Mapping[str, Any]) -> str:
+    """Metadata as JSON, with their checksum."""
+    return json.dumps({**metadata, _CRC: _checksum(metadata)}, separators=_SEPARATORS)
+
+
+def checked(text: str) -> dict[str, Any] | None:
+    """Metadata of a text of `with_checksum`; None where they differ from their checksum."""
+    metadata = _parsed(text)
+    return metadata if metadata.pop(_CRC, None) == _checksum(metadata) else None
+
+
 def _checksum(metadata: Mapping[str, Any]) -> int:
     return zlib.crc32(json.dumps(dict(metadata)).encode())
 
@@ -186,7 +197,7 @@ def _parsed(text: str) -> dict[str, Any]:
     """Return the metadata in a text; empty where it is none of `save_pages`."""
     try:
         content = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) else {}
 

@@ -1,5 +1,6 @@
 """Names and globs to files, outputs whole or not at all, a reader's failure as an error."""
 
+import ctypes
 import errno
 import glob
 import logging
@@ -255,11 +256,14 @@ def _temporary(target: Path) -> Iterator[Path]:
 
 
 def replace_folder(target: Path, new: Path) -> None:
-    """Replace a folder, if there is one, by another; the old one is removed last."""
+    """Replace a folder, if there is one, by another; the old one is removed, or stands at `new`."""
     target = target.resolve()
     if not target.exists():
         new.rename(target)
         return
+    if _exchanged(target, new):
+        return
+    # Without a folder for a moment, where the system cannot exchange two.
     old = _beside(target)
     target.rename(old)
     try:
@@ -268,6 +272,17 @@ def replace_folder(target: Path, new: Path) -> None:
         old.rename(target)
         raise
     shutil.rmtree(old)
+
+
+_AT_FOLDER, _EXCHANGE = -100, 2
+"""AT_FDCWD and RENAME_EXCHANGE of Linux."""
+
+
+def _exchanged(one: Path, other: Path) -> bool:
+    """Exchange two folders in one step; False where the system or the disk cannot."""
+    rename = getattr(ctypes.CDLL(None), "renameat2", None)
+    names = os.fsencode(one), os.fsencode(other)
+    return rename is not None and not rename(_AT_FOLDER, names[0], _AT_FOLDER, names[1], _EXCHANGE)
 
 
 def _beside(target: Path) -> Path:

@@ -1,7 +1,7 @@
 //! Pages of TIFF files.
 
 use std::collections::HashSet;
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, Read, Seek, SeekFrom};
 
 use tiff::decoder::ifd::Value;
 use tiff::decoder::{ChunkType, Decoder, DecodingSampleType, Limits};
@@ -9,7 +9,7 @@ use tiff::tags::{CompressionMethod, PhotometricInterpretation, Tag};
 use tiff::{ColorType, TiffError};
 
 use super::source::Source;
-use super::{Depth, Format, Outcome, Problem};
+use super::{Depth, Format, MAX_COMPRESSION, Outcome, Problem};
 use crate::frames::Shape;
 
 /// Version number of TIFF files with 64-bit offsets, in either byte order.
@@ -24,6 +24,9 @@ const EXPOSURE_TIME: Tag = Tag::Unknown(33434);
 
 /// Bits of `NewSubfileType`: a reduced copy of another page, or a mask.
 const NOT_A_FRAME: u32 = 0b101;
+
+/// Memory of a value of a directory while it is decoded, over its bytes in the file.
+const DECODED: usize = size_of::<Value>();
 
 impl From<TiffError> for Problem {
     fn from(error: TiffError) -> Self {
@@ -97,11 +100,50 @@ fn decoder(source: Source) -> Outcome<PageDecoder> {
     if matches!(reader.fill_buf()?.get(2..4), Some(BIG_TIFF_LITTLE | BIG_TIFF_BIG)) {
         return Err(Problem::Unsupported("BigTIFF".into()));
     }
+    check_directory(&mut reader, length)?;
     let decoder = Decoder::new(reader)?;
     let mut limits = Limits::default();
-    // A strip cannot be larger than the file, so this bounds memory as well as a fixed number.
+    // A strip, or the value of an entry, cannot be larger than the file.
     limits.intermediate_buffer_size = length;
+    limits.decoding_buffer_size = length.saturating_mul(DECODED);
     Ok(decoder.with_limits(limits))
+}
+
+/// Refuses a first directory with values larger than the file: the decoder takes memory for them
+/// before it has limits.
+fn check_directory(reader: &mut (impl Read + Seek), length: usize) -> Outcome<()> {
+    let mut head = [0; 8];
+    reader.read_exact(&mut head)?;
+    let little = head.starts_with(b"II");
+    if !little && !head.starts_with(b"MM") {
+        return Ok(reader.rewind()?); // the decoder says what it misses
+    }
+    let short = |b: &[u8]| {
+        let bytes = [b[0], b[1]];
+        if little { u16::from_le_bytes(bytes) } else { u16::from_be_bytes(bytes) }
+    };
+    let long = |b: &[u8]| {
+        let bytes = [b[0], b[1], b[2], b[3]];
+        if little { u32::from_le_bytes(bytes) } else { u32::from_be_bytes(bytes) }
+    };
+    reader.seek(SeekFrom::Start(long(&head[4..]).into()))?;
+    let mut count = [0; 2];
+    reader.read_exact(&mut count)?;
+    for _ in 0..short(&count) {
+        let mut entry = [0; 12]; // tag, type, count, value or its place
+        reader.read_exact(&mut entry)?;
+        let size: u64 = match short(&entry[2..]) {
+            3 | 8 => 2,
+            4 | 9 | 11 | 13 => 4,
+            5 | 10 | 12 | 16..=18 => 8,
+            _ => 1,
+        };
+        if size * u64::from(long(&entry[4..])) > length as u64 {
+            return Err(Problem::bad("is broken: an entry of a page is larger than the file"));
+        }
+    }
+    reader.rewind()?;
+    Ok(())
 }
 
 /// A page of a TIFF file.
@@ -115,6 +157,7 @@ impl<'c> Picture<'c> {
     pub(super) fn new(source: Source<'c>) -> Outcome<Self> {
         let mut decoder = decoder(source)?;
         check_role(&mut decoder)?;
+        check_chunks(&mut decoder)?;
         let format = Format { shape: shape(&mut decoder)?, depth: depth(&mut decoder)? };
         check_coding(&mut decoder, format)?;
         Ok(Self { decoder, format })
@@ -141,6 +184,19 @@ fn check_role(decoder: &mut PageDecoder) -> Outcome<()> {
             "holds a reduced copy or a mask beside its frames, expected frames only: \
              export them to a file of their own",
         ));
+    }
+    Ok(())
+}
+
+/// Refuses tiles and strips that no file of this length holds: a row of one is decoded at once.
+fn check_chunks(decoder: &mut PageDecoder) -> Outcome<()> {
+    let length = decoder.inner().get_ref().length() as u64;
+    let (cols, _) = decoder.chunk_dimensions();
+    let samples: u16 = decoder.find_tag_unsigned(Tag::SamplesPerPixel)?.unwrap_or(1);
+    if u64::from(cols) * u64::from(samples) / MAX_COMPRESSION as u64 > length {
+        return Err(Problem::bad(format!(
+            "claims rows of {cols} pixels in a file of {length} bytes"
+        )));
     }
     Ok(())
 }
@@ -194,4 +250,48 @@ fn check_sizes(decoder: &mut PageDecoder, format: Format) -> Outcome<()> {
         }
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::super::{Error, describe};
+    use crate::control::Control;
+
+    /// A TIFF of one page of 2×2 pixels, with one more entry: type, count and place of its values.
+    fn file(name: &str, tag: u16, kind: u16, count: u32) -> std::path::PathBuf {
+        let entries =
+            [(256, 4, 2), (257, 4, 2), (258, 3, 8), (259, 3, 1), (262, 3, 1), (273, 4, 8)];
+        let mut entries: Vec<_> = entries.map(|(tag, kind, value)| (tag, kind, 1, value)).into();
+        entries.extend([(277, 3, 1, 1), (278, 4, 1, 2), (279, 4, 1, 4), (tag, kind, count, 8)]);
+        entries.sort_unstable();
+        let mut bytes = b"II\x2a\0\x0c\0\0\0\x01\x02\x03\x04".to_vec();
+        bytes.extend((entries.len() as u16).to_le_bytes());
+        for (tag, kind, count, value) in entries {
+            bytes.extend([tag, kind].map(u16::to_le_bytes).concat());
+            bytes.extend([count, value].map(u32::to_le_bytes).concat());
+        }
+        bytes.extend([0; 4]);
+        let path = std::env::temp_dir().join(format!("{}-{name}.tif", std::process::id()));
+        std::fs::write(&path, bytes).unwrap();
+        path
+    }
+
+    fn problem(path: &Path) -> Option<String> {
+        let outcome = describe(path, &Control::default());
+        std::fs::remove_file(path).unwrap();
+        match outcome {
+            Err(Error::File { problem, .. }) => Some(problem),
+            other => other.map(|_| None).unwrap(),
+        }
+    }
+
+    #[test]
+    fn what_exceeds_the_file_is_refused_before_memory_is_taken() {
+        // SampleFormat, as many as the decoder's own limit of 256 MiB holds.
+        let words = problem(&file("entry", 339, 3, 1 << 23)).unwrap();
+        assert!(words.contains("an entry of a page is larger than the file"), "{words}");
+        assert_eq!(problem(&file("software", 305, 2, 4)), None);
+    }
 }

@@ -1,0 +1,86 @@
+"""Random files for every reader: `make fuzz`.
+
+Each target runs for FUZZ_SECONDS (0: without end), or until it has read FUZZ_INPUTS files, as many
+targets at a time as there are processors. What ends a target is kept in fuzz/artifacts.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+HERE = Path(__file__).parent
+
+COMPILED = ("tiff", "png", "pgm", "bmp")
+
+IN_PYTHON = ("npz", "hex", "bin", "fits", "toml")
+
+SECONDS, INPUTS = (int(os.environ.get(f"FUZZ_{name}") or 0) for name in ("SECONDS", "INPUTS"))
+
+COVERAGE = "level=4", "inline-8bit-counters", "pc-table", "trace-compares"
+
+
+def built() -> Path:
+    """Build the targets in Rust; flags for the machine they run on alone, not for build scripts."""
+    known = subprocess.run(["rustc", "-vV"], check=True, capture_output=True, text=True).stdout
+    host = re.search("host: (.*)", known)[1]
+    passes = ["-Cpasses=sancov-module", "--cfg=fuzzing"]
+    passes += [f"-Cllvm-args=-sanitizer-coverage-{each}" for each in COVERAGE]
+    folder = os.environ.get("CARGO_TARGET_DIR", HERE.parent / "target")
+    subprocess.run(
+        ["cargo", "build", "--locked", "--release", "--target", host],
+        cwd=HERE,
+        env=os.environ | {"RUSTFLAGS": " ".join(passes), "CARGO_TARGET_DIR": f"{folder}/fuzz"},
+        check=True,
+    )
+    return Path(folder, "fuzz", host, "release")
+
+
+def run(name: str, program: list[str]) -> bool:
+    """Run a target; say how many files it read, or how it ended."""
+    artifacts = HERE / "artifacts"
+    artifacts.mkdir(exist_ok=True)
+    flags = ["-timeout=10", "-rss_limit_mb=2048", "-print_final_stats=1"]
+    flags += [f"-max_total_time={SECONDS}", f"-artifact_prefix={artifacts}/{name}-"]
+    flags += [f"-runs={INPUTS}"] if INPUTS else []
+    memory = next((each for each in ["/dev/shm"] if os.access(each, os.W_OK)), None)
+    with tempfile.TemporaryDirectory(prefix="equipix-fuzz-", dir=memory) as folder:
+        found, files = Path(folder, "found"), Path(folder, "files")
+        found.mkdir()
+        files.mkdir()
+        command = [*program, *flags, str(found), str(HERE / "corpus" / name)]
+        done = subprocess.run(
+            command,
+            cwd=folder,
+            env=os.environ | {"TMPDIR": str(files)},
+            capture_output=True,
+            text=True,
+            errors="replace",
+            check=False,
+        )
+    told = done.stdout + done.stderr
+    read = re.search(r"number_of_executed_units: (\d+)", told)
+    print(f"{name}: {read[1] if read else 'unknown'} files, status {done.returncode}", flush=True)
+    if done.returncode:
+        print(told[-6000:], flush=True)
+    return not done.returncode
+
+
+def main(wanted: list[str]) -> int:
+    """Run all targets, or those that are named."""
+    folder = built()
+    targets = {name: [str(folder / name)] for name in COMPILED}
+    readers = str(HERE / "readers.py")
+    targets |= {name: [sys.executable, readers, name] for name in IN_PYTHON}
+    chosen = {name: each for name, each in targets.items() if name in (wanted or targets)}
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as threads:
+        return int(not all([*threads.map(run, chosen, chosen.values())]))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
