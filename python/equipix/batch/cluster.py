@@ -142,7 +142,10 @@ def scheduler_at(
     processors, free = len(os.sched_getaffinity(0)), _free_memory()
     fitting = [each for each in memory if each <= free] or [free]
     count = workers or max(1, min(processors, len(memory), free // max(fitting)))
-    cluster = _distributed().LocalCluster(
+    distributed = _distributed()
+    import dask
+
+    cluster = distributed.LocalCluster(
         n_workers=count,
         threads_per_worker=max(1, processors // count),
         processes=True,
@@ -150,7 +153,9 @@ def scheduler_at(
         dashboard_address="127.0.0.1:0",
         resources={_MEMORY: free // count},
     )
-    with cluster:
+    # Some seconds after a worker was lost, the cluster ends one of its name for good if it is just
+    # being started again: one that is killed twice.
+    with dask.config.set({"distributed.deploy.lost-worker-timeout": "1 day"}), cluster:
         yield cluster.scheduler_address
 
 

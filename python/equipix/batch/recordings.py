@@ -183,6 +183,7 @@ def correct(
         left = [job for job in jobs if job.counts() is None]
         series.results(_corrected, left, memory[0], "correcting")
         counts = _total(jobs)
+        array.clean()
         replace_folder(target, array.path)
     remove_work(target)
     lost = Counter({files[0]: counts["not_finite"]}) if counts["not_finite"] else Counter()

@@ -213,11 +213,16 @@ class ZarrFrames:
         """Whether the array is made."""
         return (self.path / "zarr.json").exists()
 
+    def clean(self) -> None:
+        """Remove what processes that were killed left of chunks they had begun."""
+        for part in self.path.rglob("*.partial"):
+            part.unlink(missing_ok=True)
+
     def write(self, start: int, frames: NDArray[Any]) -> None:
         """Write one chunk, or the last frames, and wait until they are on the disk."""
         array = _zarr_library().open_array(str(self.path), mode="r+")
         array[start : start + len(frames)] = frames
-        # The same bytes of all chunks that hold nothing but the fill value are not written.
+        # A chunk that holds nothing but the fill value is not written.
         chunk = self.path / array.metadata.encode_chunk_key((start // array.chunks[0], 0, 0))
         if chunk.exists():
             with chunk.open("rb+") as file:
