@@ -31,20 +31,6 @@ TIMES = {"started", "finished", "created", "seconds"}
 SHIFTS = [(0, 0), (0, 5), (0, 9), (5, 0), (9, 0)]
 
 
-@pytest.fixture(scope="module")
-def cluster():
-    """Two worker processes of one thread each."""
-    distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
-        n_workers=2,
-        threads_per_worker=1,
-        dashboard_address="127.0.0.1:0",
-        memory_limit=0,
-        resources={"equipix-memory": 2e9},
-    ) as cluster:
-        yield cluster
-
-
 def write_levels(folder):
     """Write three levels of a uniform source."""
     rng, lines = np.random.default_rng(5), []

@@ -5,7 +5,7 @@ use std::num::NonZeroUsize;
 use equipix_core::control::Control;
 use equipix_core::frames::{Sample, Shape, Stack};
 use equipix_core::parallel::Workers;
-use equipix_core::statistics::{Accumulator, Statistics, Summable};
+use equipix_core::statistics::{Accumulator, GROUP, Statistics, Summable};
 use equipix_core::{Error, Result};
 use proptest::prelude::*;
 
@@ -127,6 +127,76 @@ proptest! {
         let three = merged(&frames, shape, &[], 3).unwrap();
         prop_assert_eq!(format!("{one:?}"), format!("{three:?}"));
     }
+}
+
+/// Sums of frames that are added as they come, or in groups that are kept as bytes meanwhile.
+fn in_groups<T: Summable>(frames: &[T], shape: Shape, mask: &[bool], kept: bool) -> Statistics {
+    let workers = Workers::new(None).unwrap();
+    let sums = || Accumulator::<T>::new(shape, None).unwrap().masked(mask).unwrap();
+    let mut total = sums();
+    for (index, group) in frames.chunks(GROUP as usize * shape.len()).enumerate() {
+        let stack = Stack::new("frames", group, group.len() / shape.len(), shape).unwrap();
+        let mut part = sums();
+        let target = if kept { &mut part } else { &mut total };
+        target.add(&stack, &workers, &Control::new()).unwrap();
+        if kept {
+            let mut read = sums();
+            read.restore(&part.to_bytes()).unwrap();
+            if index == 0 { total = read } else { total.merge(&read).unwrap() }
+        }
+    }
+    let mut read = sums();
+    read.restore(&total.to_bytes()).unwrap();
+    assert_eq!(format!("{:?}", total.finish()), format!("{:?}", read.finish()));
+    total.finish()
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(8))]
+
+    #[test]
+    fn groups_kept_as_bytes_change_no_bit(
+        count in 1..800_usize, seed in any::<u64>(), missing in 0..3_u64,
+    ) {
+        let shape = Shape::new(33, 35);
+        let value = |i: usize| (i as u64 ^ seed).wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 40;
+        let values = (0..count * shape.len()).map(value);
+        let floats: Vec<f64> = values
+            .clone()
+            .map(|x| if x % 10 < missing { f64::NAN } else { x as f64 / 7.0 })
+            .collect();
+        let whole: Vec<u16> = values.map(|x| x as u16).collect();
+        let mask: Vec<bool> = (0..shape.len()).map(|pixel| pixel % 5 == 0).collect();
+        for mask in [&mask, &vec![false; shape.len()]] {
+            let (one, other) =
+                (in_groups(&floats, shape, mask, false), in_groups(&floats, shape, mask, true));
+            prop_assert_eq!(format!("{one:?}"), format!("{other:?}"));
+            for pixel in 0..shape.len() {
+                let (mean, variance) = naive(&floats, shape, pixel);
+                prop_assert!(close(one.mean[pixel], mean, count, 2.4e6));
+                prop_assert!(close(one.variance[pixel], variance, count, 2.4e6_f64.powi(2)));
+            }
+            let (one, other) =
+                (in_groups(&whole, shape, mask, false), in_groups(&whole, shape, mask, true));
+            prop_assert_eq!(format!("{one:?}"), format!("{other:?}"));
+        }
+    }
+}
+
+#[test]
+fn sums_that_do_not_fit_are_refused() {
+    let sums = Accumulator::<f32>::new(Shape::new(2, 3), None).unwrap();
+    let bytes = sums.to_bytes();
+    let read = |bytes: &[u8]| sums.clone().restore(bytes);
+    read(&bytes).unwrap();
+    let refused = |found| matches!(found, Err(Error::Value { argument: "state", .. }));
+    for cut in 0..bytes.len() {
+        assert!(refused(read(&bytes[..cut])));
+    }
+    assert!(refused(read(&[&bytes[..], &[0]].concat())));
+    assert!(refused(Accumulator::<f32>::new(Shape::new(3, 2), None).unwrap().restore(&bytes)));
+    assert!(refused(Accumulator::<f32>::new(Shape::new(2, 3), Some(9.0)).unwrap().restore(&bytes)));
+    assert!(refused(Accumulator::<u16>::new(Shape::new(2, 3), None).unwrap().restore(&bytes)));
 }
 
 /// Variance of the light of frames of a ramp, of which this share is missing in one frame.

@@ -1,12 +1,13 @@
 """Tasks on the workers of dask.distributed, each when the memory for it is free."""
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
-from equipix.batch.evaluation import Job, Row
 from equipix.errors import EquipixError
+
+_Result = TypeVar("_Result")
 
 _MEMORY = "equipix-memory"
 """The resource of dask that workers have as many of as bytes."""
@@ -15,40 +16,43 @@ _SHARE = 0.9
 """Share of a machine's free memory that its workers may take."""
 
 _ROUNDS = 4
-"""Times that sensors are sent, if the scheduler ends meanwhile."""
+"""Times that jobs are sent, if the scheduler ends meanwhile."""
 
 _TIMEOUT_S = 30
 
 
 class Task(NamedTuple):
-    """A job, and the bytes that it needs at the peak."""
+    """A job, which has a name of its own, and the bytes that it needs at the peak."""
 
-    job: Job
+    job: Any
     memory: int
 
 
 def finished(
-    work: Callable[[Job, int | None], Row],
+    work: Callable[[Any, int | None], _Result],
     tasks: list[Task],
     scheduler: str | None,
     workers: int | None,
-) -> Iterator[tuple[Task, Row | str]]:
-    """Each task with its row, or with the reason why there is none, as workers finish them."""
+) -> Iterator[tuple[Task, _Result | str]]:
+    """Each task with its result, or with the reason why there is none, as workers finish them."""
     left = {task.job.name: task for task in sorted(tasks, key=lambda task: -task.memory)}
-    for _ in range(_ROUNDS):
-        if not left:
-            return
-        with _client(scheduler, [*left.values()], workers) as client:
-            for task, found in _round(client, work, [*left.values()]):
-                del left[task.job.name]
-                yield task, found
+    if not left:
+        return
+    with scheduler_at(scheduler, [task.memory for task in tasks], workers) as address:
+        for _ in range(_ROUNDS):
+            if not left:
+                return
+            with _client(address) as client:
+                for task, found in _round(client, work, [*left.values()]):
+                    del left[task.job.name]
+                    yield task, found
     for task in left.values():
         yield task, f"the scheduler ended {_ROUNDS} times"
 
 
 def _round(
-    client: Any, work: Callable[[Job, int | None], Row], tasks: list[Task]
-) -> Iterator[tuple[Task, Row | str]]:
+    client: Any, work: Callable[[Any, int | None], _Result], tasks: list[Task]
+) -> Iterator[tuple[Task, _Result | str]]:
     """Tasks that are finished until the scheduler ends."""
     from distributed import as_completed
 
@@ -77,7 +81,7 @@ def _round(
 
 
 def _in_words(error: BaseException) -> str:
-    """Why a worker gave no row."""
+    """Why a worker gave no result."""
     from distributed import KilledWorker
 
     if isinstance(error, KilledWorker):
@@ -96,7 +100,7 @@ def _wait(client: Any) -> None:
         ) from error
 
 
-def _on_worker(work: Callable[[Job, int | None], Row], job: Job) -> Row:
+def _on_worker(work: Callable[[Any, int | None], _Result], job: Any) -> _Result:
     """Do the work with as many threads as the worker has."""
     from distributed import get_worker
 
@@ -104,29 +108,44 @@ def _on_worker(work: Callable[[Job, int | None], Row], job: Job) -> Row:
 
 
 @contextmanager
-def _client(scheduler: str | None, tasks: list[Task], workers: int | None) -> Iterator[Any]:
-    """A client of the scheduler, or of a cluster on this machine that ends with it."""
+def _client(scheduler: str) -> Iterator[Any]:
+    """A client of the scheduler."""
     try:
-        from distributed import Client, LocalCluster
+        client = _distributed().Client(scheduler, timeout=f"{_TIMEOUT_S}s")
+    except (OSError, ValueError) as error:
+        raise EquipixError(
+            f"the scheduler '{scheduler}' cannot be reached ({error}): name it as "
+            "tcp://HOST:PORT, and see that it runs"
+        ) from error
+    with client:
+        yield client
+
+
+def _distributed() -> Any:
+    try:
+        import distributed
     except ImportError as error:
         raise EquipixError(
-            "a batch needs dask.distributed, which is not installed: pip install 'equipix[batch]'"
+            "a cluster needs dask.distributed, which is not installed: pip install 'equipix[batch]'"
         ) from error
+    return distributed
+
+
+@contextmanager
+def scheduler_at(
+    scheduler: str | None, memory: Sequence[int], workers: int | None = None
+) -> Iterator[str]:
+    """Address of the scheduler, or of a cluster on this machine for tasks of so many bytes."""
     if scheduler is not None:
-        try:
-            client = Client(scheduler, timeout=f"{_TIMEOUT_S}s")
-        except (OSError, ValueError) as error:
-            raise EquipixError(
-                f"the scheduler '{scheduler}' cannot be reached ({error}): name it as "
-                "tcp://HOST:PORT, and see that it runs"
-            ) from error
-        with client:
-            yield client
+        yield scheduler
         return
     processors, free = len(os.sched_getaffinity(0)), _free_memory()
-    fitting = [task.memory for task in tasks if task.memory <= free] or [free]
-    count = workers or max(1, min(processors, len(tasks), free // max(fitting)))
-    cluster = LocalCluster(
+    fitting = [each for each in memory if each <= free] or [free]
+    count = workers or max(1, min(processors, len(memory), free // max(fitting)))
+    distributed = _distributed()
+    import dask
+
+    cluster = distributed.LocalCluster(
         n_workers=count,
         threads_per_worker=max(1, processors // count),
         processes=True,
@@ -134,8 +153,10 @@ def _client(scheduler: str | None, tasks: list[Task], workers: int | None) -> It
         dashboard_address="127.0.0.1:0",
         resources={_MEMORY: free // count},
     )
-    with cluster, Client(cluster) as client:
-        yield client
+    # Some seconds after a worker was lost, the cluster ends one of its name for good if it is just
+    # being started again: one that is killed twice.
+    with dask.config.set({"distributed.deploy.lost-worker-timeout": "1 day"}), cluster:
+        yield cluster.scheduler_address
 
 
 def _free_memory() -> int:

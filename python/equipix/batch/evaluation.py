@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from equipix._check import LOG
+from equipix._check import LOG, Array, Bools
 from equipix._native import __version__
 from equipix.calibration.result import Calibration, refuse_partial
 from equipix.errors import EquipixError, EquipixWarning
@@ -23,7 +23,7 @@ from equipix.experiment.experiment import Experiment
 from equipix.experiment.image_files import sha256_of
 from equipix.experiment.level_experiment import LevelExperiment
 from equipix.experiment.manifest import kind_of
-from equipix.findings import Finding, usable
+from equipix.findings import Finding, Flag
 from equipix.io.formats import checked, with_checksum
 from equipix.io.paths import write_whole
 from equipix.report.camera import camera_checks, camera_parts, figures_of
@@ -74,8 +74,9 @@ class Row(Brief):
         Kind, severity and message of each.
     figures : dict
         Main figures of the result.
-    flagged : list of list of float
-        Share of flagged pixels in parts of the sensor, 48 at most along each axis.
+    flagged : dict of str to list of list of float
+        For each `equipix.Flag` that occurs: share of such pixels in parts of the sensor, 48 at most
+        along each axis.
     result, report : str
         Names of the files in the output folder.
     key : str
@@ -94,7 +95,7 @@ class Row(Brief):
     limits: list[dict[str, str]] = field(default_factory=list)
     findings: list[dict[str, str]] = field(default_factory=list)
     figures: dict[str, Any] = field(default_factory=dict)
-    flagged: list[list[float]] = field(default_factory=list)
+    flagged: dict[str, list[list[float]]] = field(default_factory=dict)
     result: str = ""
     report: str = ""
     key: str = ""
@@ -196,7 +197,7 @@ def _evaluated(job: Job, described: Described, workers: int | None) -> Row:
     write_page(report, page([part], job.name), force=True)
     size = "{}×{}".format(*result.shape)
     row = _row(job, part.checks, result.findings, {"size": size, **summary(result)})
-    return replace(row, result=output.name, flagged=_flagged(~usable(result.flags)))
+    return replace(row, result=output.name, flagged=_flagged(result.flags))
 
 
 def _camera(job: Job, camera: CameraExperiment, workers: int | None) -> Row:
@@ -241,9 +242,14 @@ def _row(
     )
 
 
-def _flagged(flagged: np.ndarray[Any, Any]) -> list[list[float]]:
-    """Share of flagged pixels in parts of the sensor."""
-    rows, cols = (np.linspace(0, n, min(n, _PLACES) + 1).astype(int) for n in flagged.shape)
-    sums = np.add.reduceat(np.add.reduceat(flagged, rows[:-1], 0, int), cols[:-1], 1)
+def _flagged(flags: Array) -> dict[str, list[list[float]]]:
+    """Share of pixels with each flag that occurs in parts of the sensor."""
+    found = {str(flag.name): flags & flag != 0 for flag in Flag}
+    return {name: _shares(pixels) for name, pixels in found.items() if pixels.any()}
+
+
+def _shares(pixels: Bools) -> list[list[float]]:
+    rows, cols = (np.linspace(0, n, min(n, _PLACES) + 1).astype(int) for n in pixels.shape)
+    sums = np.add.reduceat(np.add.reduceat(pixels, rows[:-1], 0, int), cols[:-1], 1)
     shares = sums / np.outer(np.diff(rows), np.diff(cols))
     return [[round(float(share), 6) for share in row] for row in shares]

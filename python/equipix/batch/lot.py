@@ -11,8 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from equipix._check import Array
 from equipix.batch.evaluation import Row
 from equipix.errors import EquipixError
+from equipix.findings import Finding, Findings, Flag
 from equipix.io.paths import write_whole
 from equipix.report.maps import Map
 from equipix.report.page import Part, Table, drawn, mapped, page, write_page
@@ -20,6 +22,11 @@ from equipix.shown import Brief
 
 _MOST_TRENDS = 12
 """Most figures that are drawn over the lot."""
+
+_ANY = str(Flag.DO_NOT_USE.name)
+
+_MOST_NAMED = 10
+"""Most sensors that a finding of the lot names."""
 
 _NO_TRENDS = ("components", "sweeps", "order")
 """Figures that say nothing of a sensor."""
@@ -57,6 +64,23 @@ class Lot(Brief):
             if row.verdict:
                 counts["all limits"][row.verdict == "PASS"] += 1
         return {name: (count[True], count.total()) for name, count in counts.items()}
+
+    @property
+    def findings(self) -> Findings:
+        """What limits sensors of the lot, what limits most of them first."""
+        names: dict[tuple[str, str], list[str]] = defaultdict(list)
+        for row in self.rows:
+            if row.status == "failed":
+                names["no_result", "failure"].append(row.sensor)
+            for kind in {(each["kind"], each["severity"]) for each in row.findings}:
+                names[kind].append(row.sensor)
+        ordered = sorted(names.items(), key=lambda item: (-len(item[1]), item[0]))
+        return tuple(
+            Finding(
+                kind, f"{len(found)} of {len(self.rows)} sensors: {_some(found)}", "input", severity
+            )
+            for (kind, severity), found in ordered
+        )
 
     @property
     def columns(self) -> dict[str, list[Any]]:
@@ -113,7 +137,7 @@ class Lot(Brief):
         return Part(
             name="Lot",
             what=repr(self).strip("<>"),
-            findings=(),
+            findings=self.findings,
             checks=[],
             figures=counts,
             maps=[mapped(each) for each in self._maps()],
@@ -123,23 +147,13 @@ class Lot(Brief):
         )
 
     def _tables(self) -> Iterator[Table]:
-        """Yield by limit, findings, and the sensors with links to their pages."""
+        """Yield by limit, and the sensors with links to their pages."""
         if self.yields:
             shares = [
                 (name.replace("_", " "), f"{100 * good / of:.1f} %", str(good), str(of))
                 for name, (good, of) in self.yields.items()
             ]
             yield Table("Yield by limit", ("figure", "yield", "pass", "judged"), shares)
-        kinds: dict[str, list[str]] = defaultdict(list)
-        for row in self.rows:
-            for kind in {each["kind"] for each in row.findings}:
-                kinds[kind].append(row.sensor)
-        if kinds:
-            found = [
-                (kind.replace("_", " "), str(len(names)), ", ".join(names))
-                for kind, names in sorted(kinds.items(), key=lambda item: -len(item[1]))
-            ]
-            yield Table("Findings", ("finding", "sensors", "which"), found)
         sensors = [
             (
                 row.sensor,
@@ -152,14 +166,23 @@ class Lot(Brief):
         yield Table("Sensors", ("sensor", "verdict", "findings"), sensors, links=links)
 
     def _maps(self) -> Iterator[Map]:
-        """Where pixels are flagged, on average over the sensors of one shape."""
-        shapes: dict[str, list[list[list[float]]]] = defaultdict(list)
+        """Where sensors of one shape have each flag, and where those beyond a limit have any."""
+        shapes: dict[str, list[Row]] = defaultdict(list)
         for row in self.rows:
-            if row.flagged:
-                shapes[str(row.figures.get("size", ""))].append(row.flagged)
-        for size, shares in shapes.items():
-            words = f"Flagged share of pixels, mean of {len(shares)} sensors"
-            yield Map(f"{words} of {size}" if size else words, "", np.mean(shares, 0), "size")
+            if "size" in row.figures:
+                shapes[row.figures["size"]].append(row)
+        for size, rows in shapes.items():
+            of = f"of {len(rows)} sensors of {size}"
+            for name in dict.fromkeys(name for row in rows for name in row.flagged):
+                words = name.lower().replace("_", " ")
+                yield Map(f"Share {of} with pixels flagged '{words}' there", "", _where(rows, name))
+            limits = dict.fromkeys(name for row in rows for name in _beyond(row))
+            for limit in limits:
+                failed = [row for row in rows if limit in _beyond(row)]
+                if any(_ANY in row.flagged for row in failed):
+                    words = f"beyond the limit of {limit.replace('_', ' ')}"
+                    where = _where(failed, _ANY) * (len(failed) / len(rows))
+                    yield Map(f"Share {of} {words}, with flagged pixels there", "", where)
 
     def _trends(self) -> Iterator[tuple[str, list[float | None]]]:
         """Figures that differ between sensors."""
@@ -171,6 +194,22 @@ class Lot(Brief):
         }
         names = sorted(figures, key=lambda name: name not in judged)[:_MOST_TRENDS]
         return ((name, figures[name]) for name in names)
+
+
+def _where(rows: list[Row], flag: str) -> Array:
+    """Share of sensors that have pixels with a flag in each part."""
+    found = [np.array(row.flagged[flag]) > 0 for row in rows if flag in row.flagged]
+    return np.asarray(np.sum(found, 0) / len(rows))
+
+
+def _beyond(row: Row) -> list[str]:
+    """Figures beyond their limits."""
+    return [each["figure"] for each in row.limits if each["verdict"] == "FAIL"]
+
+
+def _some(names: list[str]) -> str:
+    more = len(names) - _MOST_NAMED
+    return ", ".join(names[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _varies(values: list[Any]) -> bool:

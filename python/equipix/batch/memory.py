@@ -8,7 +8,7 @@ from equipix.experiment.camera import CameraExperiment
 from equipix.experiment.experiment import Experiment
 from equipix.experiment.image_files import format_of
 
-_PROCESS = 300_000_000
+PROCESS = 300_000_000
 """Bytes of a process with all that it imports."""
 
 
@@ -20,8 +20,8 @@ def bytes_needed(described: Described, options: Mapping[str, Any]) -> int:
     (rows, cols), _ = format_of(described.files()[0])
     pixels, count = rows * cols, len(described.manifest.measurements)
     if isinstance(described, CameraExperiment):
-        return _PROCESS + 60 * pixels
+        return PROCESS + 60 * pixels
     if not isinstance(described, Experiment):
-        return _PROCESS + (100 + 16 * count) * pixels
+        return PROCESS + (100 + 16 * count) * pixels
     of_error_map = 112 if options.get("uncertainty") else 0
-    return _PROCESS + (150 + 16 * count + of_error_map) * pixels
+    return PROCESS + (150 + 16 * count + of_error_map) * pixels

@@ -1,16 +1,23 @@
 """Commands about frames: average, correct."""
 
+from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from equipix.batch.averages import average_in, memory_of
+from equipix.batch.recordings import correct as correct_recording
+from equipix.batch.recordings import named
+from equipix.batch.series import remove_work, series_at, work_beside
 from equipix.cli import terminal
 from equipix.correction.correct_files import correct_files, is_folder
 from equipix.errors import InputError
-from equipix.experiment.image_files import origin_of, refuse_repeated_files, with_inputs
+from equipix.experiment.image_files import refuse_repeated_files, with_inputs
 from equipix.findings import ask, say
+from equipix.io.arrays import ZARR
 from equipix.io.formats import SAVED, SUFFIXES, frame_files
 from equipix.io.paths import refuse_inputs
 from equipix.measured import statistics
@@ -38,6 +45,7 @@ def average(
         list[str] | None, typer.Option(help="Dark frames or their average, to be subtracted.")
     ] = None,
     mask: terminal.Mask = None,
+    scheduler: terminal.Scheduler = None,
     workers: terminal.Workers = None,
     force: terminal.Force = False,
     as_json: terminal.Json = False,
@@ -45,26 +53,50 @@ def average(
 ) -> None:
     """Mean and variance of every pixel over many frames."""
     terminal.check_output(output, force=force, suffixes=SUFFIXES)
-    found = averaged(frames, dark, output, mask, workers=workers, **options)
+    if scheduler is not None and options["reject"] is not None:
+        raise InputError(
+            "'reject' (--reject) compares each frame with those before, but 'scheduler' "
+            "(--scheduler) takes frames apart: leave out one"
+        )
+    found = averaged(frames, dark, output, mask, scheduler=scheduler, workers=workers, **options)
     terminal.show_saved(output, found, force=force, as_json=as_json)
+    if scheduler is not None:
+        remove_work(output)
 
 
 def averaged(
-    frames: list[str], dark: list[str] | None, output: Path, mask: Path | None, **options: Any
+    frames: list[str],
+    dark: list[str] | None,
+    output: Path,
+    mask: Path | None,
+    *,
+    scheduler: str | None = None,
+    **options: Any,
 ) -> statistics.FrameStatistics:
-    """Average frames, less their dark, with findings and the hashes of the files."""
+    """Average frames, less their dark, with findings and the hashes of the files.
+
+    With the address of a scheduler, workers of a cluster do so beside the output.
+    """
     images, offsets = frame_files(frames), frame_files(dark) if dark else []
     paths, of_darks = ([each.path for each in files] for files in (images, offsets))
     refuse_inputs([output], [*paths, *of_darks, *terminal.given(mask)])
-    hashes = refuse_repeated_files(paths, of_darks)
-    with terminal.working(mask) as (progress, excluded):
+    with terminal.working(mask) as (progress, excluded), ExitStack() as stack:
+        take: Any = partial(average_frames, progress=progress, **options)
+        digests = None
+        if scheduler is not None:
+            workers = options.pop("workers")
+            at = scheduler, work_beside(output), memory_of(images), workers, progress
+            series = stack.enter_context(series_at(*at))
+            take, digests = partial(average_in, series, **options), series.digests
+        hashes = refuse_repeated_files(paths, of_darks, digests)
+        if scheduler is not None:
+            take = partial(take, hashes=hashes)
         offset = None
         if offsets:
-            is_saved = any(map(statistics.is_average, offsets))
-            of_dark = options | ({"reject": None} if is_saved else {})
-            offset = average_frames(offsets, progress=progress, **of_dark)
+            of_dark = {"reject": None} if any(map(statistics.is_average, offsets)) else {}
+            offset = take(offsets, **of_dark)
             statistics.refuse_subtracted(offset, str(of_darks[0]))
-        found = average_frames(images, dark=offset, mask=excluded, progress=progress, **options)
+        found = take(images, dark=offset, mask=excluded)
     said = say(*average_findings(images, offsets), *ask(statistics.AVERAGED, found))
     return replace(found, findings=said, metadata=with_inputs(found.metadata, hashes))
 
@@ -91,12 +123,13 @@ def correct(
         typer.Option(
             "--output",
             "-o",
-            help="A .tif or .fits of all frames, a .png of one, or a folder: of FITS files .fits "
-            "with their headers, of others .tif.",
+            help="A .tif, .fits or .zarr of all frames, a .png of one, or a folder: of FITS files "
+            ".fits with their headers, of others .tif.",
         ),
     ],
     substrate_c: terminal.SubstrateC = None,
     bias_v: terminal.BiasV = None,
+    scheduler: terminal.Scheduler = None,
     sensor: terminal.Sensor = None,
     workers: terminal.Workers = None,
     force: terminal.Force = False,
@@ -104,22 +137,30 @@ def correct(
     **options: Any,
 ) -> None:
     """Correct frames by a calibration or by response curves."""
-    _refuse_image(output)
-    terminal.check_output(output, [correction], force=force, folder=is_folder(output))
-    applied = load_correction(correction, substrate_c=substrate_c, bias_v=bias_v)
-    state = ", ".join(f"{name} {x:g}" for name, x in applied.metadata.get("state", {}).items())
-    with terminal.working() as (progress, _):
-        done = correct_files(
-            applied,
-            frames,
-            output,
-            sensor=sensor,
-            workers=workers,
-            origin=", ".join(filter(None, (origin_of(correction), state))),
-            force=force,
-            progress=progress,
-            **options,
+    is_zarr = output.suffix.lower() in ZARR
+    if not is_zarr:
+        _refuse_image(output)
+    if scheduler is not None and not is_zarr:
+        raise InputError(
+            f"'scheduler' (--scheduler) writes a Zarr array, but '{output}' is none: name a .zarr"
         )
+    terminal.check_output(output, [correction], force=force, folder=is_folder(output))
+    given: dict[str, Any] = {"sensor": sensor, "workers": workers, "force": force, **options}
+    of_state: dict[str, float | None] = {"substrate_c": substrate_c, "bias_v": bias_v}
+    with terminal.working() as (progress, _):
+        given["progress"] = progress
+        if is_zarr:
+            if given.pop("display") is not None:
+                raise InputError(
+                    f"'display' (--display) makes pictures, but '{output}' holds values to "
+                    "measure: name a .tif, a .png of one frame or a folder, or leave it out"
+                )
+            given |= of_state
+            done = correct_recording(correction, frames, output, scheduler=scheduler, **given)
+        else:
+            applied = load_correction(correction, **of_state)
+            origin = named(correction, applied)
+            done = correct_files(applied, frames, output, origin=origin, **given)
     whole = done.dtype != "float32" and options["display"] is None
     counts = known(
         limited_values=done.limited if whole else None,

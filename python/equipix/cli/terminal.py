@@ -271,6 +271,14 @@ Workers = Annotated[
     int | None, typer.Option(min=1, help="Number of threads; one for each processor unless given.")
 ]
 
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        help="Work on many frames at a time: on a running scheduler of dask, tcp://HOST:PORT, or "
+        "on processes of this machine, local, so many as --workers."
+    ),
+]
+
 Mask = Annotated[
     Path | None,
     typer.Option(help="An image, FITS or .npy file: pixels that are not 0 in it are left out."),

@@ -29,7 +29,7 @@ from equipix.io.paths import find_files, folder_beside, refuse_inputs, write_who
 from equipix.io.png import write_png
 from equipix.io.tiff import write_frames
 
-_MARK = "corrected by equipix"
+MARK = "corrected by equipix"
 """Beginning of the description of what `correct_files` writes, so that a second correction is
 detected."""
 
@@ -167,14 +167,26 @@ def correct_files(
     beside = _Beside.of(headers, darks, origin, f"{bad} flagged pixels: {flagged}")
     _write_all(output, outputs, frames, wanted, beside, force=force)
     said += darks.findings + work.findings + warn_of_as_dark(work.as_dark, darks.names[0])
-    said += _warn_of_not_finite(work.not_finite, np.dtype(np.uint8) if display else wanted)
+    said += warn_of_not_finite(work.not_finite, np.dtype(np.uint8) if display else wanted)
     made = work.corrector
-    said += _warn_of_limited(made.clipped, total * correction.flags.size, wanted)
-    if flagged != "nan":
-        kept = correction.coefficients[:, ~good] if flagged == "keep" else np.empty((1, 0))
-        bad = int(np.count_nonzero(~np.isfinite(kept).all(axis=0)))
-    counts = made.clipped, made.extrapolated, made.replaced, bad
+    said += warn_of_limited(made.clipped, total * correction.flags.size, wanted)
+    counts = made.clipped, made.extrapolated, made.replaced, pixels_lost(correction, flagged)
     return Corrected(wanted.name, total, *counts, said)
+
+
+def as_fast(frames: Array) -> Array:
+    """Frames in a type that a `Corrector` takes."""
+    native = frames.dtype.newbyteorder("=")
+    return frames.astype(native if native in FAST else np.float32, copy=False)
+
+
+def pixels_lost(correction: Correction, flagged: Flagged) -> int:
+    """Count the flagged pixels that become NaN in each frame."""
+    good = usable(correction.flags)
+    if flagged == "nan":
+        return int(np.count_nonzero(~good))
+    kept = correction.coefficients[:, ~good] if flagged == "keep" else np.empty((1, 0))
+    return int(np.count_nonzero(~np.isfinite(kept).all(axis=0)))
 
 
 class _Correcting:
@@ -204,11 +216,8 @@ class _Correcting:
         self.done += len(frames)
         if lost := int(np.count_nonzero(~np.isfinite(frames) & self._good)):
             self.not_finite[file] += lost
-        native = frames.dtype.newbyteorder("=")
         try:
-            return self.corrector.apply(
-                frames.astype(native if native in FAST else np.float32, copy=False)
-            )
+            return self.corrector.apply(as_fast(frames))
         except InputError as error:
             raise type(error)(f"{file}: {error}") from error
 
@@ -259,7 +268,7 @@ class _Beside(NamedTuple):
     @classmethod
     def of(cls, headers: Mapping[Path, Header], darks: FileDarks, origin: str, told: str) -> Self:
         """Name the correction, the dark of each file, and what became of flagged pixels."""
-        mark = ", ".join(filter(None, (_MARK, origin)))
+        mark = ", ".join(filter(None, (MARK, origin)))
         shapes = {file: header.shape for file, header in headers.items()}
         return cls(mark, shapes, {file: (f"dark: {darks.named(file)}", told) for file in headers})
 
@@ -369,7 +378,7 @@ def _outputs(output: Path, files: list[Path], display: Display | None) -> dict[P
 
 def is_corrected(description: str) -> bool:
     """Whether the text of a file says that this module has written it."""
-    return description.startswith(_MARK)
+    return description.startswith(MARK)
 
 
 def _name(file: Path) -> str:
@@ -395,7 +404,7 @@ def warn_of_corrected(headers: Mapping[Path, Header], origin: str) -> Findings:
     return say(Finding("corrected", words, "input"))
 
 
-def _warn_of_not_finite(found: Counter[Path], dtype: np.dtype[Any]) -> Findings:
+def warn_of_not_finite(found: Counter[Path], dtype: np.dtype[Any]) -> Findings:
     """Warn of values of good pixels that are NaN or infinite, with the file that has most."""
     if not found:
         return ()
@@ -413,7 +422,7 @@ def _warn_of_not_finite(found: Counter[Path], dtype: np.dtype[Any]) -> Findings:
     return say(Finding("not_finite", words, "input"))
 
 
-def _warn_of_limited(limited: int, values: int, dtype: np.dtype[Any]) -> Findings:
+def warn_of_limited(limited: int, values: int, dtype: np.dtype[Any]) -> Findings:
     """Warn where most values are outside of the range of the output."""
     if limited <= values / 2:
         return ()

@@ -2,8 +2,9 @@
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -130,6 +131,10 @@ def _sensor_data(file: Path) -> camera_raw.SensorData:
         return camera_raw.sensor_data(file)
 
 
+Digests = Callable[[list[Path]], Mapping[Path, bytes]]
+"""What gives the SHA-256 of each of some files."""
+
+
 class Entry(NamedTuple):
     """The files of one key of experiment.toml."""
 
@@ -176,17 +181,19 @@ def refuse_repeats(
             )
 
 
-def refuse_repeated_files(frames: list[Path], dark: list[Path]) -> dict[Path, str]:
+def refuse_repeated_files(
+    frames: list[Path], dark: list[Path], digests: Digests | None = None
+) -> dict[Path, str]:
     """Refuse a file that is averaged twice, or as its own dark; return the hashes of all.
 
-    A file is the same by its name or its content.
+    A file is the same by its name or its content. `digests` is as for `sha256_of`.
 
     Raises
     ------
     FileError
         With the file and where it stands.
     """
-    found = sha256_of([*frames, *dark])
+    found = sha256_of([*frames, *dark], digests)
     for marks in (_resolved([*frames, *dark]), found):
         for one, other in _alike(frames, frames, marks):
             raise FileError(f"{_words(one, other)} twice in the frames: give each once")
@@ -281,11 +288,15 @@ def raw_frames(files: Sequence[Path]) -> Iterator[Array]:
     return (frames for _, frames in stream_frames(files))
 
 
-def sha256_of(files: Iterable[Path]) -> dict[Path, str]:
-    """Hashes of the content of files."""
-    files = list(files)
-    with ThreadPoolExecutor() as pool:  # hashlib releases the GIL
-        return dict(zip(files, pool.map(_sha256, files), strict=True))
+def sha256_of(files: Iterable[Path], digests: Digests | None = None) -> dict[Path, str]:
+    """Hashes of the content of files; `digests` hashes many plain files, such as on a cluster."""
+    given = [*files]
+    if digests is None:
+        with ThreadPoolExecutor() as pool:  # hashlib releases the GIL
+            hashes = pool.map(partial(_sha256, digest=digest), given)
+            return dict(zip(given, hashes, strict=True))
+    found = digests([part for file in given for part in _parts(split(file)[0])])
+    return {file: _sha256(file, found.__getitem__) for file in given}
 
 
 def marks_of_levels(hashes: Mapping[Path, str]) -> dict[Path, str]:
@@ -317,19 +328,24 @@ def with_inputs(metadata: dict[str, Any], hashes: Mapping[Path, str]) -> dict[st
     return {**metadata, "inputs": metadata.get("inputs", {}) | named}
 
 
-def _sha256(path: Path) -> str:
+def _sha256(path: Path, digest_of: Callable[[Path], bytes]) -> str:
     """Hash of a file; of an array in one the place counts too, of a folder all files."""
     file, place = split(path)
     if not place and file.is_file():
-        return _digest(file).hex()
+        return digest_of(file).hex()
     found = hashlib.sha256(place.encode())
-    for part in sorted(file.rglob("*")) if file.is_dir() else [file]:
-        if part.is_file():
-            found.update(str(part.relative_to(file)).encode() + _digest(part))
+    for part in _parts(file):
+        found.update(str(part.relative_to(file)).encode() + digest_of(part))
     return found.hexdigest()
 
 
-def _digest(file: Path) -> bytes:
+def _parts(file: Path) -> list[Path]:
+    """Files of a folder, or the file itself."""
+    return [part for part in sorted(file.rglob("*")) if part.is_file()] if file.is_dir() else [file]
+
+
+def digest(file: Path) -> bytes:
+    """SHA-256 of the bytes of a file."""
     with file.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").digest()
 

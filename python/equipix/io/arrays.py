@@ -5,6 +5,8 @@ An array is (rows, cols) or (..., rows, cols). In HDF5 and Zarr its place stands
 names as the default.
 """
 
+import math
+import os
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,6 +22,9 @@ from equipix.io import binary
 _AT_ONCE = 2**26
 """Most bytes that are read at once; at least a frame is."""
 
+MOST_AT_ONCE = 2**29
+"""Most bytes that are read at once where chunks of the file hold as many frames."""
+
 _NPY = b"\x93NUMPY"
 
 HDF5, ZARR = (".h5", ".hdf5", ".nxs", ".nx5"), (".zarr",)
@@ -30,6 +35,9 @@ _PLACE = re.compile(rf"(.*?(?:{'|'.join(map(re.escape, (*HDF5, *ZARR)))})):(.*)"
 """A file, and the place of an array in it."""
 
 _MOST_LISTED = 8
+
+_MARK = "description"
+"""Attribute that holds what wrote the array."""
 
 _LEAST_SIDE = 8
 """Fewest rows and columns of what is a colour image, where 3 or 4 values stand on the last axis."""
@@ -47,23 +55,50 @@ def split(path: Path) -> tuple[Path, str]:
 
 
 def header(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any], str]:
-    """Shape (n, rows, cols) and dtype of the frames; no text."""
+    """Shape (n, rows, cols) and dtype of the frames; the text that `ZarrFrames` writes."""
     with _opened(path) as array:
         *above, rows, cols = array.shape
-        return (int(np.prod(above)), rows, cols), np.dtype(array.dtype).newbyteorder("="), ""
+        text = _text(array, _MARK).strip() if hasattr(array, "attrs") else ""
+        return (int(np.prod(above)), rows, cols), np.dtype(array.dtype).newbyteorder("="), text
 
 
-def stream_frames(path: Path) -> Iterator[NDArray[Any]]:
-    """Frames of a file, some at a time, each part of shape (n, rows, cols)."""
+def stream_frames(path: Path, start: int = 0, stop: int | None = None) -> Iterator[NDArray[Any]]:
+    """Frames of a file, some at a time, each part of shape (n, rows, cols); no chunk twice."""
     with _opened(path) as array:
-        *above, rows, cols = array.shape
+        *above, _, _ = array.shape
         if not above:
             yield native(array[:, :])[None]
             return
-        count = max(1, _AT_ONCE // (rows * cols * array.dtype.itemsize))
-        for outer in np.ndindex(*above[:-1]):
-            for first in range(0, above[-1], count):
-                yield native(array[(*outer, slice(first, first + count))])
+        *outer, inner = above
+        count = _at_once(array)
+        stop = math.prod(above) if stop is None else stop
+        for number, place in enumerate(np.ndindex(*outer)):
+            here = range(inner)[max(start - number * inner, 0) : max(stop - number * inner, 0)]
+            for first in range(here.start // count * count, here.stop, count):
+                part = slice(max(first, here.start), min(first + count, here.stop))
+                yield native(array[(*place, part)])
+
+
+def chunk_frames(path: Path) -> int:
+    """Number of frames that the chunks of a file hold; 1 of a file without chunks."""
+    if split(path)[0].suffix.lower() not in (*HDF5, *ZARR):
+        return 1
+    with _opened(path) as array:
+        return _chunk_frames(array)
+
+
+def _chunk_frames(array: Any) -> int:
+    chunks = getattr(array, "chunks", None)
+    return int(chunks[-3]) if chunks is not None and len(chunks) > 2 else 1
+
+
+def _at_once(array: Any) -> int:
+    """Number of frames that are read at once: whole chunks, where there is memory for them."""
+    frame = math.prod(array.shape[-2:]) * array.dtype.itemsize
+    chunk = _chunk_frames(array)
+    if chunk * frame > MOST_AT_ONCE:
+        chunk = 1
+    return max(chunk, _AT_ONCE // frame // chunk * chunk)
 
 
 def native(values: Any) -> NDArray[Any]:
@@ -141,12 +176,62 @@ def _text(group: Any, name: str) -> str:
     return found.decode() if isinstance(found, bytes) else str(found)
 
 
-@contextmanager
-def _zarr(file: Path, place: str) -> Iterator[Any]:
+def _zarr_library() -> Any:
     try:
         import zarr
     except ImportError as error:
         raise missing("Zarr", "zarr", "zarr") from error
+    return zarr
+
+
+class ZarrFrames:
+    """A Zarr array that is written by whole chunks of frames, by several processes at once.
+
+    Parameters
+    ----------
+    path : Path
+        Folder of the array.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def create(
+        self, shape: tuple[int, int, int], dtype: np.dtype[Any], chunk: int, **texts: object
+    ) -> None:
+        """Make an array of chunks of so many frames, with texts as its attributes."""
+        _zarr_library().create_array(
+            str(self.path),
+            shape=shape,
+            dtype=dtype,
+            chunks=(chunk, *shape[1:]),
+            attributes=texts,
+            overwrite=True,
+        )
+
+    def exists(self) -> bool:
+        """Whether the array is made."""
+        return (self.path / "zarr.json").exists()
+
+    def clean(self) -> None:
+        """Remove what processes that were killed left of chunks they had begun."""
+        for part in self.path.rglob("*.partial"):
+            part.unlink(missing_ok=True)
+
+    def write(self, start: int, frames: NDArray[Any]) -> None:
+        """Write one chunk, or the last frames, and wait until they are on the disk."""
+        array = _zarr_library().open_array(str(self.path), mode="r+")
+        array[start : start + len(frames)] = frames
+        # A chunk that holds nothing but the fill value is not written.
+        chunk = self.path / array.metadata.encode_chunk_key((start // array.chunks[0], 0, 0))
+        if chunk.exists():
+            with chunk.open("rb+") as file:
+                os.fsync(file.fileno())
+
+
+@contextmanager
+def _zarr(file: Path, place: str) -> Iterator[Any]:
+    zarr = _zarr_library()
     root = zarr.open(str(file), mode="r")
     if isinstance(root, zarr.Array):
         yield root

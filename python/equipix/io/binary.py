@@ -125,12 +125,12 @@ def header(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any], str]:
     return (layout.count(_file(path)), layout.rows, layout.cols), layout.dtype, ""
 
 
-def stream_frames(path: Path) -> Iterator[NDArray[Any]]:
+def stream_frames(path: Path, start: int = 0, stop: int | None = None) -> Iterator[NDArray[Any]]:
     """Frames of a file, one at a time, each of shape (1, rows, cols)."""
     layout, file = Layout.of(path), _file(path)
     count = layout.count(file)
     with file.open("rb") as stream:
-        for index in range(count):
+        for index in range(count)[start:stop]:
             stream.seek(layout.skip + index * (layout.frame_bytes + layout.gap))
             frame = layout.values(np.fromfile(stream, np.uint8, layout.frame_bytes))
             if frame.max() >> layout.bits:

@@ -51,7 +51,7 @@ def header(
         return shape, np.dtype(np.uint16), "", (time or None,)
 
 
-def stream_frames(path: Path) -> Iterator[NDArray[Any]]:
+def stream_frames(path: Path, _start: int = 0, _stop: int | None = None) -> Iterator[NDArray[Any]]:
     """Counts of the sensor, without its dark border, in the one frame of a file."""
     with _opened(path) as raw:
         yield raw.raw_image_visible[None].copy()

@@ -169,13 +169,14 @@ def _type(units: Any) -> ImageType:
     return next((each for each in found if isinstance(each.value, str)), ImageType())
 
 
-def stream_frames(path: Path) -> Iterator[NDArray[Any]]:
+def stream_frames(path: Path, start: int = 0, stop: int | None = None) -> Iterator[NDArray[Any]]:
     """Frames of a file, one at a time, each of shape (1, rows, cols)."""
     with _opened(path) as units:
-        for unit in _images(path, units):
-            *above, rows, cols = unit.shape
-            for index in np.ndindex(*above):
-                yield native(np.reshape(_part(unit, None, index), (1, rows, cols)))
+        places = (
+            (unit, index) for unit in _images(path, units) for index in np.ndindex(*unit.shape[:-2])
+        )
+        for unit, index in islice(places, start, stop):
+            yield native(np.reshape(_part(unit, None, index), (1, *unit.shape[-2:])))
 
 
 def write_frames(

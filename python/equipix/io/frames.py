@@ -103,6 +103,13 @@ def stream_frames(
             yield path, frames
 
 
+def stream_part(
+    path: Path, start: int, stop: int, *, workers: int | None = None
+) -> Iterator[NDArray[Any]]:
+    """Frames of a file from the number `start` on to before `stop`, a few at a time."""
+    return _frames(path, workers, start, stop)
+
+
 _READERS = {
     **dict.fromkeys(arrays.SUFFIXES, arrays),
     **dict.fromkeys(fits.READ, fits),
@@ -240,18 +247,20 @@ def header(path: Path) -> Header:
     return Header(*frame_format(path), png.description(path) if suffix == ".png" else "")
 
 
-def _frames(path: Path, workers: int | None) -> Iterator[NDArray[Any]]:
+def _frames(
+    path: Path, workers: int | None, start: int = 0, stop: int | None = None
+) -> Iterator[NDArray[Any]]:
     if not is_image(path):
         with reading(path):
-            yield from _reader(path).stream_frames(path)
+            yield from _reader(path).stream_frames(path, start, stop)
         return
     check_image(path)
     with leaving_others(path):
         count, rows, cols, bits = _native.file_format(path)
         if count == 1 or count * rows * cols * bits <= 8 * _AT_ONCE:
-            yield _native.read_file(path, workers)
+            yield _native.read_file(path, workers)[start:stop]
             return
-    yield from tiff.stream_frames(path)
+    yield from tiff.stream_frames(path, start, stop)
 
 
 def _format(frames: NDArray[Any]) -> str:

@@ -241,18 +241,28 @@ def _temporary(target: Path) -> Iterator[Path]:
     """Name what becomes the target: a file or a folder beside it, removed if it is left there."""
     temporary = _beside(target)
     try:
-        yield temporary
-    except EquipixError:
-        raise
-    except OSError as error:
-        why = error.strerror or error  # without the name of the temporary file
-        full = error.errno == errno.ENOSPC
-        todo = "free space, or name another folder" if full else "name another folder"
-        raise FileError(f"{target}: cannot be written: {why}: {todo}") from error
+        with writing(target):
+            yield temporary
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
         with suppress(OSError):
             temporary.unlink()
+
+
+@contextmanager
+def writing(target: Path) -> Iterator[None]:
+    """Turn what the system refuses into an error that names the target."""
+    try:
+        yield
+    except EquipixError:
+        raise
+    except OSError as error:
+        why = error.strerror or str(error)  # without the name of the temporary file
+        # NumPy counts what it could not write, and does not pass on why.
+        full = error.errno == errno.ENOSPC or "requested and" in why
+        why = os.strerror(errno.ENOSPC) if full else why
+        todo = "free space, or name another folder" if full else "name another folder"
+        raise FileError(f"{target}: cannot be written: {why}: {todo}") from error
 
 
 def replace_folder(target: Path, new: Path) -> None:

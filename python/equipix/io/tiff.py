@@ -49,7 +49,7 @@ def header(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any], str]:
         return (count, *page.shape), page.dtype, str(page.description)
 
 
-def stream_frames(path: Path) -> Iterator[NDArray[Any]]:
+def stream_frames(path: Path, start: int = 0, stop: int | None = None) -> Iterator[NDArray[Any]]:
     """Frames of a file, one at a time, each of shape (1, rows, cols)."""
     with reading(path), tifffile.TiffFile(path) as file:
         pages = len(file.pages)
@@ -62,9 +62,9 @@ def stream_frames(path: Path) -> Iterator[NDArray[Any]]:
             # A stack with a directory for its first frame only: mapped, not read at once.
             yield from tifffile.memmap(path, mode="r")[..., None, :, :].reshape(
                 -1, 1, *file.pages[0].shape
-            )
+            )[start:stop]
             return
-        for page in file.pages:
+        for page in file.pages[start:stop]:
             frame = page.asarray()
             if frame.shape != page.shape:  # how tifffile reports missing pixels
                 raise FileError(f"{path}: is broken: a page has no pixels")

@@ -5,6 +5,7 @@ import itertools
 import operator
 import os
 from collections.abc import Iterable, Iterator
+from functools import partial
 from os import PathLike
 from typing import Any, NamedTuple
 
@@ -99,7 +100,8 @@ def average(
     .. math:: \bar x = \frac{1}{n} \sum x, \qquad s^2 = \frac{1}{n-1} \sum (x - \bar x)^2 .
 
     Samples of 8 and 16 bits are summed exactly. Others are summed as float64 in batches that are
-    merged by Chan's formula [1]_, with a relative error of some ``n/16 + 16`` roundings at most.
+    merged by Chan's formula [1]_, each 256 frames apart, with a relative error of some
+    ``n/256 + 32`` roundings at most.
     Samples that are not finite do not count; saturated ones do, and are counted apart.
 
     With `reject` a sample is compared with the mean of those before, and with a noise that pixels
@@ -141,14 +143,26 @@ def average(
             statistics = _average_batches(batches(taken), how, operator.length_hint(frames))
         if not statistics.count.any():
             raise InputError("'frames' holds no finite number: give frames with numbers")
-        options = {"saturation": how.level, "reject": statistics.reject}
-        # A saved average brings its own.
-        metadata = statistics.metadata or made(options=options, started=started, **common)
-        found = dataclasses.replace(subtracted(statistics, offset), metadata=metadata)
-        shape, level, less = found.mean.shape, found.saturation, "no" if dark is None else "its"
-        text = "averaged %d frames of %d × %d pixels, saturation level %s, %s dark subtracted"
-        LOG.info(text, found.count.max(), *shape, level, less)
-        return _masked(found, as_mask(mask, found.mean.shape))
+        return completed(statistics, offset, mask, started, common, how.level)
+
+
+def completed(
+    statistics: FrameStatistics,
+    dark: FrameStatistics | Array | None,
+    mask: ArrayLike | None,
+    started: str,
+    common: dict[str, float],
+    level: float | None,
+) -> FrameStatistics:
+    """Subtract the dark, mask pixels, and add what is known of the frames and the options."""
+    options = {"saturation": level, "reject": statistics.reject}
+    # A saved average brings its own.
+    metadata = statistics.metadata or made(options=options, started=started, **common)
+    found = dataclasses.replace(subtracted(statistics, dark), metadata=metadata)
+    shape, less = found.mean.shape, "no" if dark is None else "its"
+    text = "averaged %d frames of %d × %d pixels, saturation level %s, %s dark subtracted"
+    LOG.info(text, found.count.max(), *shape, found.saturation, less)
+    return _masked(found, as_mask(mask, found.mean.shape))
 
 
 class _How(NamedTuple):
@@ -183,7 +197,7 @@ def _average_files(files: list[FrameFile], how: _How) -> FrameStatistics:
     paths = [file.path for file in files]
     LOG.info("files to average: %d, the first %s", len(paths), paths[0])
     LOG.debug("reads %s", ", ".join(map(str, paths)))
-    _refuse_mixed(files)
+    refuse_mixed(files)
     if any(path.suffix.lower() in ONLY_RESULTS for path in paths):
         return _saved(files, how)
     if how.rejection is None and all(map(is_image, paths)):
@@ -201,7 +215,7 @@ def _average_files(files: list[FrameFile], how: _How) -> FrameStatistics:
     return _average_batches(given, how, len(paths))
 
 
-def _refuse_mixed(files: list[FrameFile]) -> None:
+def refuse_mixed(files: list[FrameFile]) -> None:
     """Refuse files of different exposure times, where they hold them."""
     if len(files) < 2:
         return
@@ -287,13 +301,31 @@ class RunningAverage:
         self._dtype = sum_dtype(first) if rejection is None else np.dtype(np.float64)
         shape = first.shape[-2:]
         excluded = as_mask(mask, shape)
-        self._sums = _native.Accumulator(self._dtype.name, shape, self._level, excluded, workers)
+        given = self._dtype.name, shape, self._level, excluded, workers
+        self._new = partial(_native.Accumulator, *given)
+        self._sums = self._new()
         self.count = 0
 
     def add(self, frames: Array) -> None:
         """Add frames, shape (n, rows, cols)."""
         self._sums.add(unmasked(frames, self._dtype))
         self.count += len(frames)
+
+    def state(self) -> Array:
+        """Return the sums as bytes, uint8."""
+        return self._sums.state()
+
+    def merge(self, state: Array) -> None:
+        """Add the sums of later frames, as `state` of others of the same options gave them.
+
+        Raises
+        ------
+        InputError
+            If they are of other frames or incomplete.
+        """
+        later = self._new()
+        later.restore(state)
+        self._sums.merge(later)
 
     def statistics(self) -> FrameStatistics:
         """Mean and scatter of all frames so far, no dark subtracted."""

@@ -15,18 +15,26 @@ _BATCH = 16  # frames handed over at once
 
 _BATCH_BYTES = 2**26
 
+GROUP = 256
+"""Frames of floating-point numbers that the core sums before it merges them to those before."""
+
 _SUMMABLE = ("uint8", "uint16", "float32", "float64")
 
 
 def batches(frames: Array | Iterator[Any]) -> Iterator[Array]:
-    """Give the frames a few at a time: views of an array, copies of what an iterator gives."""
+    """Give the frames a few at a time: views of an array, copies of what an iterator gives.
+
+    None are of two groups: so a group that is summed elsewhere has the same sums.
+    """
     if isinstance(frames, np.ndarray):
         if frames.ndim != 3 or 0 in frames.shape:
             raise InputError(
                 f"'frames' has shape {frames.shape}, expected (frames, rows, cols), none of them 0"
             )
         size = _batch_size(frames[0])
-        yield from (frames[start : start + size] for start in range(0, len(frames), size))
+        for first in range(0, len(frames), GROUP):
+            group = frames[first : first + GROUP]
+            yield from (group[start : start + size] for start in range(0, len(group), size))
         return
     first = _frame(0, next(frames))
     empty = np.ma.empty if isinstance(first, np.ma.MaskedArray) else np.empty
@@ -40,8 +48,8 @@ def batches(frames: Array | Iterator[Any]) -> Iterator[Array]:
             )
         batch[filled] = frame
         filled += 1
-        if filled == len(batch):
-            yield batch
+        if filled == len(batch) or (index + 1) % GROUP == 0:
+            yield batch[:filled]
             filled = 0
     if filled:
         yield batch[:filled]

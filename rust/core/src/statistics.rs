@@ -14,6 +14,9 @@
 //! n = nₐ + n_b    δ = x̄_b − x̄ₐ    x̄ = x̄ₐ + δ n_b/n    M = Mₐ + M_b + δ² nₐ n_b/n    s² = M / (n − 1)
 //! ```
 //!
+//! Their frames are taken in groups of 256, each summed by itself and then merged to those before. So
+//! groups may be summed anywhere, stored as bytes, and merged in their order: the result is the same.
+//!
 //! The light may vary between frames. What it does to all pixels together shows in the means of the
 //! frames over all pixels, whose variance is kept, one number, added frame by frame in their order.
 //! Pixels may be left out of these means. Where samples are missing, frames are means over different
@@ -32,7 +35,9 @@ use crate::frames::{Sample, Shape, Stack};
 use crate::memory;
 use crate::parallel::Workers;
 
+mod bytes;
 mod light;
+use bytes::{Bytes, Reader};
 use light::{FloatLight, Light, WholeLight};
 
 /// Pixels of one block: their sums stay in the first-level cache while a batch passes.
@@ -40,6 +45,9 @@ const BLOCK: usize = 1024;
 
 /// Frames of one batch: enough to hide the traffic of the sums behind that of the frames.
 const BATCH: usize = 16;
+
+/// Frames of floating-point numbers that are summed before they are merged to those before.
+pub const GROUP: u32 = 256;
 
 /// Mean and scatter of repeated frames, pixel by pixel.
 #[derive(Clone, Debug, PartialEq)]
@@ -75,9 +83,11 @@ pub trait Summable: Sample {
 }
 
 /// Partial sums of a block of pixels.
-pub trait PartialSums<T>: Clone + std::fmt::Debug + Send + Sync {
+pub trait PartialSums<T>: Bytes + Clone + std::fmt::Debug + Send + Sync {
     /// Bytes of the sums of one pixel.
     const BYTES: usize;
+    /// Whether frames are summed in groups: the order of sums changes their last bits.
+    const GROUPED: bool;
     /// Sums of no samples at all for `pixels` pixels.
     fn new(pixels: usize) -> Self;
     /// Adds the same block of several frames.
@@ -85,8 +95,9 @@ pub trait PartialSums<T>: Clone + std::fmt::Debug + Send + Sync {
     /// Sum and number of the samples of each frame that was added, over the first values of pixels;
     /// `left_out` is empty, or tells for each pixel whether it does not count.
     fn totals(&self, frames: &[&[T]], left_out: &[bool]) -> Vec<(f64, usize)>;
-    /// Sum and number of the differences between the first values of `other` and these.
-    fn offsets(&self, other: &Self) -> (f64, usize);
+    /// Sum and number of the differences between the first values of `other` and these, without
+    /// pixels that are `left_out`.
+    fn offsets(&self, other: &Self, left_out: &[bool]) -> (f64, usize);
     /// Adds what `other` has summed over the same pixels; its first values are higher by `offset`.
     fn merge(&mut self, other: &Self, offset: f64);
     /// Appends the block's pixels to `statistics`.
@@ -121,6 +132,7 @@ pub struct ExactSums {
 
 impl<T: Sample + Into<u32>> PartialSums<T> for ExactSums {
     const BYTES: usize = 8 + 8 + 4;
+    const GROUPED: bool = false;
 
     fn new(pixels: usize) -> Self {
         let zeros = || vec![0; pixels];
@@ -159,7 +171,7 @@ impl<T: Sample + Into<u32>> PartialSums<T> for ExactSums {
         frames.iter().map(total).collect()
     }
 
-    fn offsets(&self, _: &Self) -> (f64, usize) {
+    fn offsets(&self, _: &Self, _: &[bool]) -> (f64, usize) {
         (0.0, 0)
     }
 
@@ -181,6 +193,22 @@ impl<T: Sample + Into<u32>> PartialSums<T> for ExactSums {
         statistics.variance.extend(self.sum.iter().zip(&self.squares).map(variance));
         statistics.count.resize(statistics.count.len() + self.sum.len(), self.count);
         statistics.saturated.extend(&self.saturated);
+    }
+}
+
+impl Bytes for ExactSums {
+    fn write(&self, bytes: &mut Vec<u8>) {
+        self.count.write(bytes);
+        self.sum.write(bytes);
+        self.squares.write(bytes);
+        self.saturated.write(bytes);
+    }
+
+    fn read(&mut self, reader: &mut Reader<'_>) -> Option<()> {
+        self.count.read(reader)?;
+        self.sum.read(reader)?;
+        self.squares.read(reader)?;
+        self.saturated.read(reader)
     }
 }
 
@@ -230,6 +258,7 @@ impl Moments {
 
 impl<T: Sample> PartialSums<T> for Moments {
     const BYTES: usize = 4 + 8 + 8 + 4 + 8;
+    const GROUPED: bool = true;
 
     fn new(pixels: usize) -> Self {
         let zeros = || vec![0.0; pixels];
@@ -261,10 +290,12 @@ impl<T: Sample> PartialSums<T> for Moments {
         frames.iter().map(total).collect()
     }
 
-    fn offsets(&self, other: &Self) -> (f64, usize) {
+    fn offsets(&self, other: &Self, left_out: &[bool]) -> (f64, usize) {
         let pairs = self.first.iter().zip(&other.first).map(|(here, there)| there - here);
-        let known = pairs.filter(|difference| difference.is_finite());
-        known.fold((0.0, 0), |(sum, count), difference| (sum + difference, count + 1))
+        let known = pairs
+            .enumerate()
+            .filter(|&(i, difference)| difference.is_finite() && left_out.get(i) != Some(&true));
+        known.fold((0.0, 0), |(sum, count), (_, difference)| (sum + difference, count + 1))
     }
 
     #[inline(always)]
@@ -295,15 +326,63 @@ impl<T: Sample> PartialSums<T> for Moments {
     }
 }
 
+impl Bytes for Moments {
+    fn write(&self, bytes: &mut Vec<u8>) {
+        self.count.write(bytes);
+        self.saturated.write(bytes);
+        [&self.mean, &self.scatter, &self.first].iter().for_each(|each| each.write(bytes));
+    }
+
+    fn read(&mut self, reader: &mut Reader<'_>) -> Option<()> {
+        self.count.read(reader)?;
+        self.saturated.read(reader)?;
+        self.mean.read(reader)?;
+        self.scatter.read(reader)?;
+        self.first.read(reader)
+    }
+}
+
+/// Sums over some frames.
+#[derive(Clone, Debug)]
+struct Part<T: Summable> {
+    light: T::Light,
+    blocks: Vec<T::Sums>,
+}
+
+impl<T: Summable> Part<T> {
+    fn new(shape: Shape) -> Self {
+        let blocks = (0..shape.len()).step_by(BLOCK);
+        let blocks = blocks.map(|start| T::Sums::new(BLOCK.min(shape.len() - start))).collect();
+        Self { light: T::Light::default(), blocks }
+    }
+
+    /// By how much the first values of `later` are higher.
+    fn offset(&self, later: &Self, left_out: &[bool]) -> f64 {
+        let pairs = self.blocks.iter().zip(&later.blocks).enumerate();
+        let offsets = pairs.map(|(index, (a, b))| a.offsets(b, block_of(left_out, index)));
+        let (sum, count) = offsets.fold((0.0, 0), |(a, m), (b, n)| (a + b, m + n));
+        sum / count.max(1) as f64
+    }
+
+    fn merge(&mut self, later: &Self, left_out: &[bool]) {
+        let offset = self.offset(later, left_out);
+        self.light.merge(&later.light, offset);
+        self.blocks.iter_mut().zip(&later.blocks).for_each(|(a, b)| a.merge(b, offset));
+    }
+}
+
 /// Partial sums of frames of one shape; its size does not depend on their number.
 #[derive(Clone, Debug)]
 pub struct Accumulator<T: Summable> {
     shape: Shape,
     saturation: f64,
     frames: u32,
-    light: T::Light,
     left_out: Vec<bool>,
-    blocks: Vec<T::Sums>,
+    /// Whole groups, merged in their order.
+    earlier: Option<Part<T>>,
+    /// The last group, and the number of its frames.
+    group: Part<T>,
+    in_group: u32,
 }
 
 impl<T: Summable> Accumulator<T> {
@@ -320,10 +399,8 @@ impl<T: Summable> Accumulator<T> {
             return Err(Error::value("saturation", "is NaN, expected a level in DN"));
         }
         memory::check(Self::bytes(shape), || format!("averaging frames of {shape}"))?;
-        let blocks = (0..shape.len()).step_by(BLOCK);
-        let blocks = blocks.map(|start| T::Sums::new(BLOCK.min(shape.len() - start))).collect();
-        let (light, left_out) = (T::Light::default(), Vec::new());
-        Ok(Self { shape, saturation, frames: 0, light, left_out, blocks })
+        let (group, left_out) = (Part::new(shape), Vec::new());
+        Ok(Self { shape, saturation, frames: 0, left_out, earlier: None, group, in_group: 0 })
     }
 
     /// The same sums, of which pixels where `mask` is true show no light.
@@ -347,7 +424,8 @@ impl<T: Summable> Accumulator<T> {
 
     /// Bytes of the sums over frames of `shape` and of what comes of them.
     pub(crate) const fn bytes(shape: Shape) -> u64 {
-        (shape.len() as u64).saturating_mul((T::Sums::BYTES + Statistics::BYTES) as u64)
+        let parts = if T::Sums::GROUPED { 2 } else { 1 };
+        (shape.len() as u64).saturating_mul((parts * T::Sums::BYTES + Statistics::BYTES) as u64)
     }
 
     /// Adds frames.
@@ -359,24 +437,48 @@ impl<T: Summable> Accumulator<T> {
         self.fits(frames.shape())?;
         self.frames = self.total(frames.count())?;
         let all: Vec<&[T]> = (0..frames.count()).map(|index| frames.frame(index)).collect();
-        for batch in all.chunks(BATCH) {
-            let totals = workers.map_blocks(&mut self.blocks, 1, |index, block| {
-                if control.is_cancelled() {
-                    return Vec::new();
-                }
-                add_block::<T>(&mut block[0], batch, index * BLOCK, self.saturation, &self.left_out)
-            });
-            control.check()?;
-            for frame in 0..batch.len() {
-                let every = totals.iter().map(|block| block[frame]);
-                let (sum, count) = every.fold((0.0, 0), |(a, m), (b, n)| (a + b, m + n));
-                self.light.add(sum, count);
+        let mut rest = all.as_slice();
+        while !rest.is_empty() {
+            if T::Sums::GROUPED && self.in_group >= GROUP {
+                self.close_group();
             }
+            let room = if T::Sums::GROUPED { (GROUP - self.in_group) as usize } else { BATCH };
+            let (batch, others) = rest.split_at(rest.len().min(BATCH).min(room));
+            self.add_batch(batch, workers, control)?;
+            rest = others;
         }
         Ok(())
     }
 
-    /// Adds what `other` has summed, with the same mask.
+    fn add_batch(&mut self, batch: &[&[T]], workers: &Workers, control: &Control) -> Result<()> {
+        let (saturation, left_out) = (self.saturation, &self.left_out);
+        let totals = workers.map_blocks(&mut self.group.blocks, 1, |index, block| {
+            if control.is_cancelled() {
+                return Vec::new();
+            }
+            add_block::<T>(&mut block[0], batch, index, saturation, left_out)
+        });
+        control.check()?;
+        for frame in 0..batch.len() {
+            let every = totals.iter().map(|block| block[frame]);
+            let (sum, count) = every.fold((0.0, 0), |(a, m), (b, n)| (a + b, m + n));
+            self.group.light.add(sum, count);
+        }
+        self.in_group = self.in_group.saturating_add(batch.len() as u32);
+        Ok(())
+    }
+
+    /// Merges the last group to those before.
+    fn close_group(&mut self) {
+        let whole = std::mem::replace(&mut self.group, Part::new(self.shape));
+        match &mut self.earlier {
+            Some(earlier) => earlier.merge(&whole, &self.left_out),
+            None => self.earlier = Some(whole),
+        }
+        self.in_group = 0;
+    }
+
+    /// Adds what `other` has summed over later frames, with the same mask.
     ///
     /// # Errors
     /// As [`add`](Self::add), and [`Error::Value`] if the saturation levels differ.
@@ -387,27 +489,104 @@ impl<T: Summable> Accumulator<T> {
             return Err(Error::value("saturation", format!("is {there}, expected {here} as here")));
         }
         self.frames = self.total(other.frames as usize)?;
-        let pairs = self.blocks.iter().zip(&other.blocks).map(|(a, b)| a.offsets(b));
-        let (sum, count) = pairs.fold((0.0, 0), |(a, m), (b, n)| (a + b, m + n));
-        let offset = sum / count.max(1) as f64;
-        self.light.merge(&other.light, offset);
-        self.blocks.iter_mut().zip(&other.blocks).for_each(|(a, b)| a.merge(b, offset));
+        if self.in_group > 0 {
+            self.close_group();
+        }
+        for part in other.earlier.iter().chain((other.in_group > 0).then_some(&other.group)) {
+            match &mut self.earlier {
+                Some(earlier) => earlier.merge(part, &self.left_out),
+                None => self.earlier = Some(part.clone()),
+            }
+        }
         Ok(())
+    }
+
+    /// The sums as bytes, which [`restore`](Self::restore) takes; the mask is no part of them.
+    #[must_use]
+    pub fn to_bytes(&self) -> Vec<u8> {
+        let (rows, cols) = (self.shape.rows as u64, self.shape.cols as u64);
+        let mut bytes = Vec::with_capacity(128 + self.shape.len() * T::Sums::BYTES);
+        bytes.extend([T::Sums::GROUPED.into(), (T::Sums::BYTES as u8)]);
+        bytes.extend([rows, cols].map(u64::to_le_bytes).as_flattened());
+        bytes.extend(self.saturation.to_le_bytes());
+        bytes.extend([self.frames, self.in_group].map(u32::to_le_bytes).as_flattened());
+        bytes.push(self.earlier.is_some().into());
+        for part in self.earlier.iter().chain(Some(&self.group)) {
+            part.light.write(&mut bytes);
+            part.blocks.iter().for_each(|block| block.write(&mut bytes));
+        }
+        bytes
+    }
+
+    /// Takes the sums that [`to_bytes`](Self::to_bytes) gave in the place of its own.
+    ///
+    /// # Errors
+    /// [`Error::Value`] if they are of another shape, type or saturation level, or incomplete;
+    /// nothing is changed then.
+    pub fn restore(&mut self, bytes: &[u8]) -> Result<()> {
+        let problem = "are no sums of such frames: delete them, and add the frames again";
+        self.restored(bytes).ok_or_else(|| Error::value("state", problem))
+    }
+
+    fn restored(&mut self, bytes: &[u8]) -> Option<()> {
+        let mut reader = Reader::new(bytes);
+        let kind = reader.take(2)?;
+        let sizes: [u64; 2] = [reader.number()?, reader.number()?];
+        let is_same = kind == [T::Sums::GROUPED.into(), (T::Sums::BYTES as u8)]
+            && sizes == [self.shape.rows as u64, self.shape.cols as u64]
+            && reader.number::<f64>()? == self.saturation;
+        let (frames, in_group) = (reader.number::<u32>()?, reader.number::<u32>()?);
+        let has_earlier = reader.take(1)? == [1];
+        if !is_same {
+            return None;
+        }
+        let earlier = if has_earlier { Some(self.part(&mut reader)?) } else { None };
+        let group = self.part(&mut reader)?;
+        reader.is_empty().then_some(())?;
+        (self.frames, self.in_group, self.earlier, self.group) = (frames, in_group, earlier, group);
+        Some(())
+    }
+
+    fn part(&self, reader: &mut Reader<'_>) -> Option<Part<T>> {
+        let mut part = Part::<T>::new(self.shape);
+        part.light.read(reader)?;
+        part.blocks.iter_mut().try_for_each(|block| block.read(reader))?;
+        Some(part)
     }
 
     /// Mean and variance of all that was added.
     #[must_use]
     pub fn finish(&self) -> Statistics {
+        let Some(earlier) = &self.earlier else { return self.finished(&self.group, None) };
+        self.finished(earlier, (self.in_group > 0).then_some(&self.group))
+    }
+
+    /// What the sums come to, with those over later frames: block by block, in no memory of a frame.
+    fn finished(&self, sums: &Part<T>, later: Option<&Part<T>>) -> Statistics {
         let size = self.shape.len();
+        let offset = later.map_or(0.0, |later| sums.offset(later, &self.left_out));
+        let mut light = sums.light.clone();
+        if let Some(later) = later {
+            light.merge(&later.light, offset);
+        }
         let mut statistics = Statistics {
             shape: self.shape,
             mean: Vec::with_capacity(size),
             variance: Vec::with_capacity(size),
             count: Vec::with_capacity(size),
             saturated: Vec::with_capacity(size),
-            light_variance: self.light.variance(),
+            light_variance: light.variance(),
         };
-        self.blocks.iter().for_each(|block| block.finish(&mut statistics));
+        for (index, block) in sums.blocks.iter().enumerate() {
+            match later {
+                Some(later) => {
+                    let mut both = block.clone();
+                    both.merge(&later.blocks[index], offset);
+                    both.finish(&mut statistics);
+                }
+                None => block.finish(&mut statistics),
+            }
+        }
         statistics
     }
 
@@ -428,18 +607,25 @@ impl<T: Summable> Accumulator<T> {
     }
 }
 
-/// Adds the pixels from `start` on of a batch of frames, by the widest vectors the processor has;
+/// The values of a block's pixels; none of none.
+fn block_of(mask: &[bool], index: usize) -> &[bool] {
+    let start = index * BLOCK;
+    &mask[start.min(mask.len())..mask.len().min(start + BLOCK)]
+}
+
+/// Adds the pixels of a block of a batch of frames, by the widest vectors the processor has;
 /// the sum and number of those that show the light of each frame.
 fn add_block<T: Summable>(
     block: &mut T::Sums,
     batch: &[&[T]],
-    start: usize,
+    index: usize,
     saturation: f64,
     left_out: &[bool],
 ) -> Vec<(f64, usize)> {
+    let start = index * BLOCK;
     let pieces: Vec<&[T]> =
         batch.iter().map(|frame| &frame[start..frame.len().min(start + BLOCK)]).collect();
-    let left_out = &left_out[start.min(left_out.len())..left_out.len().min(start + BLOCK)];
+    let left_out = block_of(left_out, index);
     pulp::Arch::new().dispatch(
         #[inline(always)]
         || {

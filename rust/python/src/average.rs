@@ -7,7 +7,11 @@ use equipix_core::frames::{Shape, Stack};
 use equipix_core::io::{self, AnyFrames, Frames};
 use equipix_core::parallel::Workers;
 use equipix_core::statistics::{self, Statistics, Summable};
-use numpy::{Element, IntoPyArray, PyArray2, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3};
+use numpy::{
+    Element, IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2,
+    PyReadonlyArray3,
+};
+use pyo3::exceptions::PyTypeError;
 use pyo3::prelude::*;
 
 use crate::{errors, run};
@@ -66,6 +70,43 @@ impl Accumulator {
             Sums::F32(sums) => add(sums, frames, self.workers),
             Sums::F64(sums) => add(sums, frames, self.workers),
         }
+    }
+
+    /// Adds what another of the same dtype has summed over later frames.
+    fn merge(&mut self, py: Python<'_>, other: PyRef<'_, Self>) -> PyResult<()> {
+        let later = &other.sums;
+        let merged = py.detach(|| match (&mut self.sums, later) {
+            (Sums::U8(sums), Sums::U8(later)) => Some(sums.merge(later)),
+            (Sums::U16(sums), Sums::U16(later)) => Some(sums.merge(later)),
+            (Sums::F32(sums), Sums::F32(later)) => Some(sums.merge(later)),
+            (Sums::F64(sums), Sums::F64(later)) => Some(sums.merge(later)),
+            _ => None,
+        });
+        let merged = merged.ok_or_else(|| PyTypeError::new_err("other: not the frames' dtype"))?;
+        merged.map_err(|error| errors::exception(py, &error))
+    }
+
+    /// The sums as bytes, uint8.
+    fn state<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<u8>> {
+        let bytes = py.detach(|| match &self.sums {
+            Sums::U8(sums) => sums.to_bytes(),
+            Sums::U16(sums) => sums.to_bytes(),
+            Sums::F32(sums) => sums.to_bytes(),
+            Sums::F64(sums) => sums.to_bytes(),
+        });
+        bytes.into_pyarray(py)
+    }
+
+    /// Takes sums that `state` gave in the place of its own.
+    fn restore(&mut self, py: Python<'_>, state: PyReadonlyArray1<'_, u8>) -> PyResult<()> {
+        let bytes = state.as_slice()?;
+        let restored = py.detach(|| match &mut self.sums {
+            Sums::U8(sums) => sums.restore(bytes),
+            Sums::U16(sums) => sums.restore(bytes),
+            Sums::F32(sums) => sums.restore(bytes),
+            Sums::F64(sums) => sums.restore(bytes),
+        });
+        restored.map_err(|error| errors::exception(py, &error))
     }
 
     /// Mean, variance, count and number of saturated samples, each (rows, cols).

@@ -1,7 +1,9 @@
 //! Variance of the means of frames over all pixels: of the light, where it varies between frames.
 
+use super::bytes::{Bytes, Reader};
+
 /// What is kept of the means of frames; its size does not depend on their number.
-pub trait Light: Clone + Default + std::fmt::Debug + Send + Sync {
+pub trait Light: Bytes + Clone + Default + std::fmt::Debug + Send + Sync {
     /// Adds a frame with this sum over so many samples.
     fn add(&mut self, sum: f64, samples: usize);
     /// Adds what `other` has of later frames, whose means count from a level that is higher by
@@ -46,6 +48,22 @@ impl Light for WholeLight {
     }
 }
 
+impl Bytes for WholeLight {
+    fn write(&self, bytes: &mut Vec<u8>) {
+        self.frames.write(bytes);
+        (self.samples as u64).write(bytes);
+        self.sum.write(bytes);
+        self.squares.write(bytes);
+    }
+
+    fn read(&mut self, reader: &mut Reader<'_>) -> Option<()> {
+        self.frames.read(reader)?;
+        self.samples = reader.number::<u64>()?.try_into().ok()?;
+        self.sum.read(reader)?;
+        self.squares.read(reader)
+    }
+}
+
 /// Mean of the means and their Σ(x − x̄)², by Chan's formula.
 #[derive(Clone, Debug, Default)]
 pub struct FloatLight {
@@ -71,5 +89,17 @@ impl Light for FloatLight {
 
     fn variance(&self) -> f64 {
         if self.frames < 2.0 { f64::NAN } else { self.scatter / (self.frames - 1.0) }
+    }
+}
+
+impl Bytes for FloatLight {
+    fn write(&self, bytes: &mut Vec<u8>) {
+        [self.frames, self.mean, self.scatter].iter().for_each(|each| each.write(bytes));
+    }
+
+    fn read(&mut self, reader: &mut Reader<'_>) -> Option<()> {
+        self.frames.read(reader)?;
+        self.mean.read(reader)?;
+        self.scatter.read(reader)
     }
 }

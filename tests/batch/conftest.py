@@ -1,0 +1,22 @@
+"""What tests of clusters share."""
+
+import pytest
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """Two worker processes of one thread each."""
+    distributed = pytest.importorskip("distributed")
+    # Without it a worker that is killed again and again ends for good, as in cluster.py.
+    kept = {"distributed.deploy.lost-worker-timeout": "1 day"}
+    with (
+        pytest.importorskip("dask").config.set(kept),
+        distributed.LocalCluster(
+            n_workers=2,
+            threads_per_worker=1,
+            dashboard_address="127.0.0.1:0",
+            memory_limit=0,
+            resources={"equipix-memory": 2e9},
+        ) as cluster,
+    ):
+        yield cluster
