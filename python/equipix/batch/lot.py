@@ -7,14 +7,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from equipix._check import Array
 from equipix.batch.evaluation import Row
 from equipix.errors import EquipixError
-from equipix.findings import Finding, Findings, Flag
+from equipix.findings import Finding, Findings, Flag, Severity
 from equipix.io.paths import write_whole
 from equipix.report.maps import Map
 from equipix.report.page import Part, Table, drawn, mapped, page, write_page
@@ -68,12 +68,12 @@ class Lot(Brief):
     @property
     def findings(self) -> Findings:
         """What limits sensors of the lot, what limits most of them first."""
-        names: dict[tuple[str, str], list[str]] = defaultdict(list)
+        names: dict[tuple[str, Severity], list[str]] = defaultdict(list)
         for row in self.rows:
             if row.status == "failed":
                 names["no_result", "failure"].append(row.sensor)
-            for kind in {(each["kind"], each["severity"]) for each in row.findings}:
-                names[kind].append(row.sensor)
+            for each in {(each["kind"], each["severity"]) for each in row.findings}:
+                names[cast("tuple[str, Severity]", each)].append(row.sensor)
         ordered = sorted(names.items(), key=lambda item: (-len(item[1]), item[0]))
         return tuple(
             Finding(

@@ -6,7 +6,7 @@ import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -171,7 +171,7 @@ class Series:
             for job in jobs:
                 yield job.name, work(job, self._workers)
             return
-        tasks, caught = [Task(job, memory) for job in jobs], _Caught(work)
+        tasks, caught = [Task(job, memory) for job in jobs], partial(_caught, work)
         for task, result in finished(caught, tasks, self._address, None):
             yield task.job.name, result
 
@@ -214,16 +214,12 @@ class _Failed(NamedTuple):
     error: EquipixError
 
 
-class _Caught(NamedTuple):
-    """Work whose error of ours is a result: the cluster does not try it again."""
-
-    work: Callable[[Any, int | None], Any]
-
-    def __call__(self, job: Any, workers: int | None) -> Any:
-        try:
-            return self.work(job, workers)
-        except EquipixError as error:
-            return _Failed(error)
+def _caught(work: Callable[[Any, int | None], Any], job: Any, workers: int | None) -> Any:
+    """Do work whose error of ours is a result: the cluster does not try it again."""
+    try:
+        return work(job, workers)
+    except EquipixError as error:
+        return _Failed(error)
 
 
 @contextmanager

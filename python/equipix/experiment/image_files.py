@@ -293,7 +293,7 @@ def sha256_of(files: Iterable[Path], digests: Digests | None = None) -> dict[Pat
     given = [*files]
     if digests is None:
         with ThreadPoolExecutor() as pool:  # hashlib releases the GIL
-            hashes = pool.map(partial(_sha256, digest=digest), given)
+            hashes = pool.map(partial(_sha256, digest_of=digest), given)
             return dict(zip(given, hashes, strict=True))
     found = digests([part for file in given for part in _parts(split(file)[0])])
     return {file: _sha256(file, found.__getitem__) for file in given}

@@ -98,7 +98,7 @@ def _at_once(array: Any) -> int:
     chunk = _chunk_frames(array)
     if chunk * frame > MOST_AT_ONCE:
         chunk = 1
-    return max(chunk, _AT_ONCE // frame // chunk * chunk)
+    return int(max(chunk, _AT_ONCE // frame // chunk * chunk))
 
 
 def native(values: Any) -> NDArray[Any]:

@@ -20,17 +20,13 @@ use crate::frames::{Shape, Stack};
 use crate::memory;
 use crate::parallel::Workers;
 use crate::statistics::{Accumulator, Statistics, Summable};
-use source::Source;
+use source::{MAX_COMPRESSION, Source};
 
 /// Frames of one batch: enough for the workers and the sums, few enough to stay small.
 const BATCH: usize = 16;
 
 /// Bytes of one batch, unless every worker's one frame takes more.
 const BATCH_BYTES: usize = 1 << 26;
-
-/// No lossless coding in use here packs tighter: a header that claims more is forged or broken, and
-/// memory for it must not even be asked for.
-const MAX_COMPRESSION: usize = 4096;
 
 /// The frames of one file.
 #[derive(Clone, Debug)]

@@ -12,6 +12,10 @@ const PIECE: usize = 1 << 22;
 /// Bytes of a TIFF header: byte order, version, offset of the first directory.
 const HEADER: usize = 8;
 
+/// No lossless coding in use here packs tighter: a header that claims more is forged or broken, and
+/// memory for it must not even be asked for.
+pub(super) const MAX_COMPRESSION: usize = 4096;
+
 /// A file that stops being readable when the work is cancelled, and whose TIFF header can be made
 /// to point at any page: so each page has a decoder of its own, and they work in parallel.
 pub(super) struct Source<'c> {

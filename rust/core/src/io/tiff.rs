@@ -8,8 +8,8 @@ use tiff::decoder::{ChunkType, Decoder, DecodingSampleType, Limits};
 use tiff::tags::{CompressionMethod, PhotometricInterpretation, Tag};
 use tiff::{ColorType, TiffError};
 
-use super::source::Source;
-use super::{Depth, Format, MAX_COMPRESSION, Outcome, Problem};
+use super::source::{MAX_COMPRESSION, Source};
+use super::{Depth, Format, Outcome, Problem};
 use crate::frames::Shape;
 
 /// Version number of TIFF files with 64-bit offsets, in either byte order.
@@ -256,7 +256,7 @@ fn check_sizes(decoder: &mut PageDecoder, format: Format) -> Outcome<()> {
 mod tests {
     use std::path::Path;
 
-    use super::super::{Error, describe};
+    use super::{Problem, Source, directories};
     use crate::control::Control;
 
     /// A TIFF of one page of 2×2 pixels, with one more entry: type, count and place of its values.
@@ -279,11 +279,12 @@ mod tests {
     }
 
     fn problem(path: &Path) -> Option<String> {
-        let outcome = describe(path, &Control::default());
+        let control = Control::default();
+        let outcome = directories(Source::open(path, None, &control).unwrap());
         std::fs::remove_file(path).unwrap();
         match outcome {
-            Err(Error::File { problem, .. }) => Some(problem),
-            other => other.map(|_| None).unwrap(),
+            Err(Problem::Bad(words, _) | Problem::Unsupported(words)) => Some(words),
+            Ok(_) => None,
         }
     }
 
