@@ -506,7 +506,9 @@ class TestCorrectedFiles:
         read = []
         monkeypatch.setattr(images, "_AT_ONCE", 1)
         stream = tiff.stream_frames
-        monkeypatch.setattr(tiff, "stream_frames", lambda path: read.append(path) or stream(path))
+        monkeypatch.setattr(
+            tiff, "stream_frames", lambda path, *part: read.append(path) or stream(path, *part)
+        )
         single, _ = call("single.tif")
         assert len(read) == 1
         np.testing.assert_array_equal(read_frames(single), read_frames(whole))

@@ -1,7 +1,7 @@
 //! Pages of TIFF files.
 
 use std::collections::HashSet;
-use std::io::{BufRead, BufReader, Read, Seek, SeekFrom};
+use std::io::{BufRead, BufReader, Seek, SeekFrom};
 
 use tiff::decoder::ifd::Value;
 use tiff::decoder::{ChunkType, Decoder, DecodingSampleType, Limits};
@@ -111,13 +111,14 @@ fn decoder(source: Source) -> Outcome<PageDecoder> {
 
 /// Refuses a first directory with values larger than the file: the decoder takes memory for them
 /// before it has limits.
-fn check_directory(reader: &mut (impl Read + Seek), length: usize) -> Outcome<()> {
+fn check_directory(reader: &mut (impl BufRead + Seek), length: usize) -> Outcome<()> {
+    let start = reader.fill_buf()?;
+    let little = start.starts_with(b"II");
+    if !little && !start.starts_with(b"MM") {
+        return Ok(()); // the decoder says what it misses
+    }
     let mut head = [0; 8];
     reader.read_exact(&mut head)?;
-    let little = head.starts_with(b"II");
-    if !little && !head.starts_with(b"MM") {
-        return Ok(reader.rewind()?); // the decoder says what it misses
-    }
     let short = |b: &[u8]| {
         let bytes = [b[0], b[1]];
         if little { u16::from_le_bytes(bytes) } else { u16::from_be_bytes(bytes) }

@@ -32,6 +32,9 @@ const FOLDED: usize = 32;
 /// Rows of cells that a thread converts at a time.
 const CONVERTED: usize = 16;
 
+/// Cells, the taps along columns that look at them, and rows of what they see.
+type Looked<'s> = (&'s [f32], &'s [[f32; TAPS]], Ring);
+
 /// What a fused product needs of one linearisation.
 pub(super) struct Fused {
     bands: Bands,
@@ -103,8 +106,7 @@ impl Fused {
         &mut self,
         pass: &mut Pass<'_, '_, T>,
         penalty: (&Penalty, &[f32]),
-        x: &[f32],
-        (logs, moves): (&[f64], &[[f64; 2]]),
+        (x, logs, moves): (&[f32], &[f64], &[[f64; 2]]),
         share: f64,
         product: &mut [f32],
         control: &Control,
@@ -122,7 +124,7 @@ impl Fused {
         let sizes = [fused.bands.height * of_row, fused.bands.length];
         let bands = pass.workers.map_pairs(&mut rows, &mut sums, sizes, |band, rows, strips| {
             let rows = rows.chunks_exact_mut(of_row);
-            fused.band(seen, (x, places.clone()), share, band, rows, strips, control)
+            fused.band(seen, (x, places.clone(), share), band, rows, strips, control)
         });
         (pass.rows, self.sums) = (rows, sums);
         pass.count += 1;
@@ -146,8 +148,7 @@ impl Fused {
     fn band<'r, T: Real>(
         &self,
         pass: &Pass<'_, '_, T>,
-        (x, mut places): (&[f32], Vec<Place>),
-        share: f64,
+        (x, mut places, share): (&[f32], Vec<Place>, f64),
         band: usize,
         rows: impl ExactSizeIterator<Item = &'r mut [f64]>,
         strips: &mut [f32],
@@ -170,7 +171,7 @@ impl Fused {
         let (first, mut largest) = (band * self.bands.height, 0.0_f64);
         let height = rows.len();
         strips.fill(0.0);
-        let look = |seen: &mut [(&[f32], &[[f32; TAPS]], Ring); 3], row: usize| {
+        let look = |seen: &mut [Looked<'_>; 3], row: usize| {
             for (cells, taps, seen) in &mut seen[..looked] {
                 for (k, window) in pass.windows.iter().enumerate() {
                     let at = (first + row + window.row) * stride + window.col;

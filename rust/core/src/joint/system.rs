@@ -108,8 +108,8 @@ impl Precision for f32 {
         });
         control.check()?;
         let logs = system.fluxes.spread(step.theta);
-        let (penalty, others) = ((penalty, &system.scale[..]), (&logs[..], step.moves));
-        fused.pull(&mut system.pass, penalty, step.cells, others, share, pull, control)
+        let (penalty, step) = ((penalty, &system.scale[..]), (step.cells, &logs[..], step.moves));
+        fused.pull(&mut system.pass, penalty, step, share, pull, control)
     }
 }
 
