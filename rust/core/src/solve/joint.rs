@@ -199,7 +199,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         }
         let ended = self.ended();
         if ended.is_none() {
-            self.step(search, [first, error], kept, preconditioner, control)?;
+            self.step(search, first, kept, preconditioner, control)?;
         }
         Ok(ended)
     }
@@ -264,13 +264,13 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
     fn step<N: Precision>(
         &mut self,
         mut search: ConjugateGradients<N>,
-        [first, error]: [f64; 2],
+        first: f64,
         slope: Option<Vec<f64>>,
         preconditioner: &Preconditioner,
         control: &Control,
     ) -> Result<()> {
         let least = if N::IS_SINGLE { PRECISION } else { CURVED[0] };
-        let share = if slope.is_some() { BY_SHIFTS } else { error.clamp(least, CURVED[1]) };
+        let share = if slope.is_some() { BY_SHIFTS } else { first.clamp(least, CURVED[1]) };
         let reachable = first * share;
         let (mut least, mut waited) = (first, 0);
         while self.products() + A_LOOK < self.limit && waited < PATIENCE_OF_A_SEARCH {
