@@ -76,8 +76,8 @@ pub(super) fn minimise<T: Real>(
 struct Steps<'m, 'a, T> {
     system: System<'m, 'a, T>,
     known: Known,
-    /// Whether products may be made in single precision.
-    allows_single: bool,
+    /// Looks after which products are made in double precision alone, since single precision no longer sufficed.
+    doubled: Option<usize>,
     options: &'m Options,
     /// The most passes.
     limit: u64,
@@ -124,7 +124,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         Ok(Self {
             system,
             known: Known::default(),
-            allows_single: true,
+            doubled: None,
             options,
             limit,
             swept,
@@ -166,7 +166,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             Some(preconditioner) => preconditioner,
             None => Preconditioner::new(&mut self.system, control)?,
         };
-        let is_single = self.allows_single && self.system.has_single();
+        let is_single = self.doubled.is_none() && self.system.has_single();
         let look = if is_single { Self::look::<f32> } else { Self::look::<f64> };
         let sought = self.system.seeks_shifts();
         let ended = look(self, objective, slope, &preconditioner, control)?;
@@ -301,7 +301,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         self.taken = Some(step);
         if waited == PATIENCE_OF_A_SEARCH && N::IS_SINGLE {
             // Its smallest Ritz value is that of rounding too.
-            (self.allows_single, self.known) = (false, Known::default());
+            (self.doubled, self.known) = (Some(self.looks.len()), Known::default());
         }
         Ok(())
     }
@@ -329,8 +329,11 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         let settled = last.error <= ROUNDING;
         let certain = self.known.iterations >= FEWEST_ITERATIONS || settled;
         let patience = if self.system.seeks_shifts() { PATIENCE_BY_SHIFTS } else { 0 };
-        let stalled = stalled_since(&self.looks).is_some_and(|earlier| {
-            earlier >= SETTLING && self.looks[earlier].sweep + patience <= last.sweep
+        // What was estimated by a smallest Ritz value that has been forgotten is no progress to compare with.
+        let since = self.doubled.unwrap_or_default();
+        let looks = self.looks.get(since..).unwrap_or_default();
+        let stalled = stalled_since(looks).is_some_and(|earlier| {
+            since + earlier >= SETTLING && looks[earlier].sweep + patience <= last.sweep
         });
         if certain && last.error <= self.options.tolerance {
             Some(Ended::Converged)
