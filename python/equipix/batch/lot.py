@@ -68,7 +68,7 @@ class Lot(Brief):
     @property
     def findings(self) -> Findings:
         """What limits sensors of the lot, what limits most of them first."""
-        names: dict[tuple[str, str], list[str]] = defaultdict(list)
+        names: dict[tuple[str, Any], list[str]] = defaultdict(list)
         for row in self.rows:
             if row.status == "failed":
                 names["no_result", "failure"].append(row.sensor)

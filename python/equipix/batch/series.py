@@ -171,7 +171,8 @@ class Series:
             for job in jobs:
                 yield job.name, work(job, self._workers)
             return
-        tasks, caught = [Task(job, memory) for job in jobs], _Caught(work)
+        tasks = [Task(job, memory) for job in jobs]
+        caught: Callable[[Any, int | None], object] = _Caught(work)
         for task, result in finished(caught, tasks, self._address, None):
             yield task.job.name, result
 

@@ -96,7 +96,7 @@ def averaged(
             of_dark = {"reject": None} if any(map(statistics.is_average, offsets)) else {}
             offset = take(offsets, **of_dark)
             statistics.refuse_subtracted(offset, str(of_darks[0]))
-        found = take(images, dark=offset, mask=excluded)
+        found: statistics.FrameStatistics = take(images, dark=offset, mask=excluded)
     said = say(*average_findings(images, offsets), *ask(statistics.AVERAGED, found))
     return replace(found, findings=said, metadata=with_inputs(found.metadata, hashes))
 

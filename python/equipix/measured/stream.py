@@ -32,8 +32,8 @@ def batches(frames: Array | Iterator[Any]) -> Iterator[Array]:
                 f"'frames' has shape {frames.shape}, expected (frames, rows, cols), none of them 0"
             )
         size = _batch_size(frames[0])
-        for first in range(0, len(frames), GROUP):
-            group = frames[first : first + GROUP]
+        for begin in range(0, len(frames), GROUP):
+            group = frames[begin : begin + GROUP]
             yield from (group[start : start + size] for start in range(0, len(group), size))
         return
     first = _frame(0, next(frames))
