@@ -6,7 +6,7 @@ import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -172,7 +172,7 @@ class Series:
                 yield job.name, work(job, self._workers)
             return
         tasks = [Task(job, memory) for job in jobs]
-        caught: Callable[[Any, int | None], object] = _Caught(work)
+        caught = partial(_caught, work)
         for task, result in finished(caught, tasks, self._address, None):
             yield task.job.name, result
 
@@ -215,16 +215,12 @@ class _Failed(NamedTuple):
     error: EquipixError
 
 
-class _Caught(NamedTuple):
+def _caught(work: Callable[[Any, int | None], Any], job: Any, workers: int | None) -> Any:
     """Work whose error of ours is a result: the cluster does not try it again."""
-
-    work: Callable[[Any, int | None], Any]
-
-    def __call__(self, job: Any, workers: int | None) -> Any:
-        try:
-            return self.work(job, workers)
-        except EquipixError as error:
-            return _Failed(error)
+    try:
+        return work(job, workers)
+    except EquipixError as error:
+        return _Failed(error)
 
 
 @contextmanager
