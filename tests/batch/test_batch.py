@@ -124,7 +124,37 @@ def test_one_bad_sensor_does_not_stop_the_others(lot, tmp_path, cluster):
     found = run(lot, tmp_path, cluster)
     assert [row.status for row in found.rows] == ["failed", "done", "done"]
     assert "dark" in found.rows[0].reason
-    assert "dark" in (tmp_path / "results" / "lot.html").read_text()
+    page = (tmp_path / "results" / "lot.html").read_text()
+    assert "dark" in page
+    assert "Failure, no result." in page
+    assert "1 of 3 sensors: a-experiment" in page
+    assert "nothing contradicts" not in page
+
+
+def test_maps_show_where_sensors_are_flagged_and_beyond_a_limit():
+    """Two of four sensors have dead pixels in a corner, one of them beyond a limit; one failed."""
+    none, corner = np.zeros((4, 5)), np.zeros((4, 5))
+    corner[0, 0] = 0.3
+    marks = {"DO_NOT_USE": corner.tolist(), "DEAD": corner.tolist()}
+    beyond = [{"figure": "flagged_share", "verdict": "FAIL"}]
+    size = {"size": "40×50"}
+    rows = (
+        Row("a", "", status="done", flagged=marks, limits=beyond, figures=size),
+        Row("b", "", status="done", flagged=marks, figures=size),
+        Row("c", "", status="done", flagged={"HOT": none.tolist()}, figures=size),
+        Row("d", "", status="done", figures=size),
+        Row("e", ""),
+    )
+    maps = {each.name: each.values for each in batch.Lot(rows)._maps()}
+    share = "Share of 4 sensors of 40×50"
+    wanted = {
+        f"{share} with pixels flagged 'do not use' there": 0.5,
+        f"{share} with pixels flagged 'dead' there": 0.5,
+        f"{share} with pixels flagged 'hot' there": 0.0,
+        f"{share} beyond the limit of flagged share, with flagged pixels there": 0.25,
+    }
+    assert {name: values[0, 0] for name, values in maps.items()} == wanted
+    assert all(values.ravel()[1:].max() == 0 for values in maps.values())
 
 
 @pytest.mark.long
@@ -370,7 +400,7 @@ def test_a_disk_that_is_full_is_told_and_the_rest_done_later(lot, tmp_path, clus
     try:
         failed = run(lot, tmp_path, cluster).failed
         assert failed
-        assert all("cannot be written" in row.reason for row in failed)
+        assert all("No space left on device: free space" in row.reason for row in failed)
         assert not [*output.glob(".*")]
         for file in output.glob("*.json"):
             row = Row(**checked(file.read_text()))

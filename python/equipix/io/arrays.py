@@ -94,7 +94,7 @@ def _chunk_frames(array: Any) -> int:
 
 def _at_once(array: Any) -> int:
     """Number of frames that are read at once: whole chunks, where there is memory for them."""
-    frame = math.prod(array.shape[-2:]) * array.dtype.itemsize
+    frame = int(math.prod(array.shape[-2:]) * array.dtype.itemsize)
     chunk = _chunk_frames(array)
     if chunk * frame > MOST_AT_ONCE:
         chunk = 1
