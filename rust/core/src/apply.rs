@@ -353,9 +353,10 @@ impl<T: Precision> Corrector<T> {
             }
         }
         let tally = Tally::default();
-        let correct = |index: usize, frame: &[I], block: &mut [O]| {
+        let half = size.div_ceil(2).max(BLOCK);
+        let correct = |at: usize, frame: &[I], block: &mut [O]| {
             if !control.is_cancelled() {
-                let (at, length) = (index * BLOCK, block.len());
+                let length = block.len();
                 tally.add(self.correct_block(at, &frame[at..at + length], block, largest));
             }
         };
@@ -363,20 +364,21 @@ impl<T: Precision> Corrector<T> {
         // Threads give back results of no size, for which nothing is allocated.
         if frames.len() <= BRIEF {
             for (frame, out) in each {
-                let blocks = out.chunks_mut(BLOCK).enumerate();
-                workers.share(blocks, |(index, part)| correct(index, frame, part));
+                // The same half by the same thread, whose cache holds the coefficients.
+                let halves = out.chunks_mut(half).enumerate();
+                workers.share(halves, |(index, part)| correct(index * half, frame, part));
                 self.finish(frame, out, largest, &tally);
             }
         } else if size <= BRIEF {
             workers.map_blocks(out, size, |index, out| {
                 let frame = &frames[index * size..][..size];
                 let blocks = out.chunks_mut(BLOCK).enumerate();
-                blocks.for_each(|(index, part)| correct(index, frame, part));
+                blocks.for_each(|(index, part)| correct(index * BLOCK, frame, part));
                 self.finish(frame, out, largest, &tally);
             });
         } else {
             for (frame, out) in each {
-                workers.map_blocks(out, BLOCK, |index, part| correct(index, frame, part));
+                workers.map_blocks(out, BLOCK, |index, part| correct(index * BLOCK, frame, part));
                 self.finish(frame, out, largest, &tally);
             }
         }
