@@ -334,8 +334,9 @@ class Corrector:
         Name of the sensor that gives the frames, to be compared with that of the correction.
     workers : int, optional
         Number of threads; by default one for each processor. It changes no bit of the result. Up to
-        2²⁰ values the calling thread works alone; of larger stacks each thread takes whole frames,
-        and of frames of more than 2²⁰ pixels parts.
+        2²⁰ values are corrected by the calling thread, and by one beside it while less than 0.2 ms
+        pass between two calls; for so long that one waits without sleep. Of larger stacks each
+        thread takes whole frames, and of frames of more than 2²⁰ pixels parts.
 
     Attributes
     ----------

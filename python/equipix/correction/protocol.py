@@ -233,7 +233,7 @@ class Depth(NamedTuple):
     def refuse_type(self, dtype: np.dtype[Any]) -> None:
         """Refuse whole numbers of fewer bits."""
         # A saturation level of 256 may be given for 8 bits, so one bit less is no other depth.
-        if dtype.kind == "u" and np.iinfo(dtype).max < self.largest // 2:
+        if dtype.kind == "u" and 8 * dtype.itemsize < self.bits - 1:
             raise InputError(
                 f"'frames' is {dtype}, but the correction was measured with {self.bits} bits: "
                 "frames of another sensor or bit depth"

@@ -25,10 +25,10 @@ use crate::parallel::Workers;
 /// Pixels that a thread corrects at a time.
 const BLOCK: usize = 1 << 15;
 
-/// Most pixels that the calling thread corrects alone: a quarter of a millisecond, in which other
-/// threads would hardly have started. Of larger stacks each thread takes whole frames, and of larger
+/// Most pixels that the calling thread corrects with at most one thread beside it: a quarter of a millisecond, in
+/// which more threads would hardly have started. Of larger stacks each thread takes whole frames, and of larger
 /// frames blocks.
-const ALONE: usize = 1 << 20;
+const BRIEF: usize = 1 << 20;
 
 /// Largest number of coefficients: those of a cubic.
 const PLANES: usize = 4;
@@ -353,25 +353,32 @@ impl<T: Precision> Corrector<T> {
             }
         }
         let tally = Tally::default();
-        let correct = |index: usize, frame: &[I], block: &mut [O]| {
+        let half = size.div_ceil(2).max(BLOCK);
+        let correct = |at: usize, frame: &[I], block: &mut [O]| {
             if !control.is_cancelled() {
-                let (at, length) = (index * BLOCK, block.len());
+                let length = block.len();
                 tally.add(self.correct_block(at, &frame[at..at + length], block, largest));
             }
         };
-        let alone = |frame: &[I], out: &mut [O]| {
-            out.chunks_mut(BLOCK).enumerate().for_each(|(index, part)| correct(index, frame, part));
-            self.finish(frame, out, largest, &tally);
-        };
         let each = frames.chunks(size).zip(out.chunks_mut(size));
         // Threads give back results of no size, for which nothing is allocated.
-        if frames.len() <= ALONE {
-            each.for_each(|(frame, out)| alone(frame, out));
-        } else if size <= ALONE {
-            workers.map_blocks(out, size, |index, out| alone(&frames[index * size..][..size], out));
+        if frames.len() <= BRIEF {
+            for (frame, out) in each {
+                // The same half by the same thread, whose cache holds the coefficients.
+                let halves = out.chunks_mut(half).enumerate();
+                workers.share(halves, |(index, part)| correct(index * half, frame, part));
+                self.finish(frame, out, largest, &tally);
+            }
+        } else if size <= BRIEF {
+            workers.map_blocks(out, size, |index, out| {
+                let frame = &frames[index * size..][..size];
+                let blocks = out.chunks_mut(BLOCK).enumerate();
+                blocks.for_each(|(index, part)| correct(index * BLOCK, frame, part));
+                self.finish(frame, out, largest, &tally);
+            });
         } else {
             for (frame, out) in each {
-                workers.map_blocks(out, BLOCK, |index, part| correct(index, frame, part));
+                workers.map_blocks(out, BLOCK, |index, part| correct(index * BLOCK, frame, part));
                 self.finish(frame, out, largest, &tally);
             }
         }

@@ -8,6 +8,7 @@ use std::num::NonZeroUsize;
 use std::ops;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
 
 use rayon::prelude::*;
 
@@ -16,6 +17,9 @@ use crate::error::{Error, Result};
 
 /// Values that a thread writes between two looks at whether to stop.
 const FILLED: usize = 1 << 16;
+
+/// How long a thread beside that of a caller stays awake for the next short work. To wake one takes some 50 µs.
+const AWAKE: Duration = Duration::from_micros(200);
 
 /// Numbers of single or double precision.
 pub(crate) trait Value:
@@ -101,14 +105,44 @@ pub struct Workers {
     pool: Arc<rayon::ThreadPool>,
     /// Whether a thread of the pool runs [`enter`](Workers::enter).
     entered: Arc<AtomicBool>,
+    beside: Arc<Beside>,
 }
 
-/// The pools of this process, by process id and number of threads.
+/// A thread that takes a part of the short works of one caller at a time.
+#[derive(Debug, Default)]
+struct Beside {
+    is_awake: AtomicBool,
+    /// The pool of this thread alone, and when the last work ended.
+    last: Mutex<Option<(rayon::ThreadPool, Instant)>>,
+}
+
+impl Beside {
+    /// Lets the thread wait for works without sleep, until none has come for a while.
+    fn keep_awake(self: &Arc<Self>, pool: &rayon::ThreadPool) {
+        let beside = Arc::clone(self);
+        self.is_awake.store(true, Ordering::Release);
+        pool.spawn(move || {
+            let mut last = Instant::now();
+            while last.elapsed() < AWAKE {
+                match rayon::yield_now() {
+                    Some(rayon::Yield::Executed) => last = Instant::now(),
+                    _ => std::hint::spin_loop(),
+                }
+            }
+            beside.is_awake.store(false, Ordering::Release);
+        });
+    }
+}
+
+/// The pools of this process, by process id and number of threads, where one is asked for.
 ///
 /// A forked child inherits the table but not the threads, so the id is part of the key; the
 /// parent's pools stay in the child's table untouched, since to drop one would wait for threads
 /// that the child does not have.
-static POOLS: Mutex<Option<HashMap<(u32, usize), Workers>>> = Mutex::new(None);
+static POOLS: Mutex<Option<HashMap<Key, Workers>>> = Mutex::new(None);
+
+/// Process id, and number of threads.
+type Key = (u32, Option<NonZeroUsize>);
 
 /// Lets the next enter, also after a panic.
 struct Leave<'w>(&'w AtomicBool);
@@ -121,27 +155,27 @@ impl Drop for Leave<'_> {
 
 impl Workers {
     /// The pool of `count` threads, started at its first use; `None` means every processor that
-    /// this process may run on.
+    /// this process may run on at the first call. To count them takes as long as to correct a small frame.
     ///
     /// # Errors
     /// [`Error::Workers`] if the threads cannot be started.
     pub fn new(count: Option<NonZeroUsize>) -> Result<Self> {
-        let available = || std::thread::available_parallelism().map_or(1, NonZeroUsize::get);
-        let count = count.map_or_else(available, NonZeroUsize::get);
-        let mut guard = POOLS.lock().unwrap_or_else(PoisonError::into_inner);
-        let pools = guard.get_or_insert_default();
-        let key = (std::process::id(), count);
-        if let Some(workers) = pools.get(&key) {
+        let key = |count| (std::process::id(), count);
+        let pools = || POOLS.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(workers) = pools().get_or_insert_default().get(&key(count)) {
             return Ok(workers.clone());
         }
-        let pool = rayon::ThreadPoolBuilder::new()
-            .num_threads(count)
-            .thread_name(|index| format!("equipix-{index}"))
-            .build()
-            .map_err(|error| Error::Workers { workers: count, reason: error.to_string() })?;
-        let workers = Self { pool: Arc::new(pool), entered: Arc::default() };
-        pools.insert(key, workers.clone());
-        Ok(workers)
+        let workers = match count {
+            Some(count) => Self::started(count.get())?,
+            None => {
+                Self::new(Some(std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN)))?
+            }
+        };
+        Ok(pools().get_or_insert_default().entry(key(count)).or_insert(workers).clone())
+    }
+
+    fn started(count: usize) -> Result<Self> {
+        Ok(Self { pool: Arc::new(pool(count)?), entered: Arc::default(), beside: Arc::default() })
     }
 
     /// How many threads the pool has.
@@ -163,6 +197,41 @@ impl Workers {
         }
         let _leave = Leave(&self.entered);
         self.pool.install(work)
+    }
+
+    /// Calls `work` for each part on this thread, and also on another one if that is awake: it is while short
+    /// works follow one another.
+    ///
+    /// A thread that sleeps would start when a work of 50 µs is over, so the first of a series of works is
+    /// done here alone; so are works of other callers meanwhile.
+    pub(crate) fn share<P>(&self, parts: impl Iterator<Item = P> + Send, work: impl Fn(P) + Sync) {
+        let parts = Mutex::new(parts);
+        let next = || parts.lock().unwrap_or_else(PoisonError::into_inner).next();
+        let take = || std::iter::from_fn(next).for_each(&work);
+        let beside = &self.beside;
+        let Some(mut last) = (self.count() > 1).then(|| beside.last.try_lock().ok()).flatten()
+        else {
+            return take();
+        };
+        match &mut *last {
+            Some((pool, _)) if beside.is_awake.load(Ordering::Acquire) => {
+                pool.in_place_scope(|scope| {
+                    scope.spawn(|_| take());
+                    take();
+                });
+            }
+            Some((pool, ended)) => {
+                if ended.elapsed() < AWAKE {
+                    beside.keep_awake(pool);
+                }
+                take();
+            }
+            None => take(),
+        }
+        match &mut *last {
+            Some((_, ended)) => *ended = Instant::now(),
+            None => *last = pool(1).ok().map(|pool| (pool, Instant::now())),
+        }
     }
 
     /// Calls `work` for 0, 1, … `count` − 1 in parallel; the results stand in that order.
@@ -265,6 +334,15 @@ impl Workers {
     }
 }
 
+/// A pool of rayon's.
+fn pool(count: usize) -> Result<rayon::ThreadPool> {
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(count)
+        .thread_name(|index| format!("equipix-{index}"))
+        .build();
+    pool.map_err(|error| Error::Workers { workers: count, reason: error.to_string() })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -290,6 +368,44 @@ mod tests {
     fn a_pool_of_one_thread_stays_free() {
         let workers = Workers::new(NonZeroUsize::new(1)).unwrap();
         assert!(!workers.enter(is_inside));
+    }
+
+    #[test]
+    fn short_works_that_follow_one_another_take_two_threads() {
+        let workers = Workers::new(NonZeroUsize::new(4)).unwrap();
+        // Under load the other thread may start late, but not in every of so many works.
+        let shared = (0..100_000).any(|_| {
+            let [here, there] = [0, 0].map(std::sync::atomic::AtomicUsize::new);
+            workers.share(0..64_usize, |part| {
+                (0..1000).for_each(|_| std::hint::spin_loop());
+                let sum = if is_inside() { &there } else { &here };
+                sum.fetch_add(1 << part.min(6), Ordering::Relaxed);
+            });
+            let [here, there] = [here, there].map(std::sync::atomic::AtomicUsize::into_inner);
+            assert_eq!(here + there, 63 + 58 * 64);
+            there > 0
+        });
+        assert!(shared);
+    }
+
+    #[test]
+    fn works_of_a_pool_of_one_thread_and_of_several_callers_are_done_by_themselves() {
+        let one = Workers::new(NonZeroUsize::new(1)).unwrap();
+        one.share(0..9, |_| assert!(!is_inside()));
+        let several = Workers::new(NonZeroUsize::new(3)).unwrap();
+        std::thread::scope(|scope| {
+            for _ in 0..4 {
+                scope.spawn(|| {
+                    for _ in 0..100 {
+                        let sum = std::sync::atomic::AtomicUsize::new(0);
+                        several.share(0..50, |part| {
+                            sum.fetch_add(part, Ordering::Relaxed);
+                        });
+                        assert_eq!(sum.into_inner(), 49 * 25);
+                    }
+                });
+            }
+        });
     }
 
     #[test]

@@ -23,21 +23,29 @@ use crate::{errors, run};
 /// Most values that are corrected without a look at signals: some milliseconds.
 const BRIEF: usize = 1 << 24;
 
-/// Raw frames of any type that cameras deliver.
+/// Raw frames of any type that cameras deliver, the most frequent first: each type that does not fit takes time.
 #[derive(FromPyObject)]
 pub(crate) enum PyRaw<'py> {
-    U8(PyReadonlyArray3<'py, u8>),
+    #[pyo3(transparent)]
     U16(PyReadonlyArray3<'py, u16>),
+    #[pyo3(transparent)]
+    U8(PyReadonlyArray3<'py, u8>),
+    #[pyo3(transparent)]
     F32(PyReadonlyArray3<'py, f32>),
+    #[pyo3(transparent)]
     F64(PyReadonlyArray3<'py, f64>),
 }
 
 /// Where corrected frames go.
 #[derive(FromPyObject)]
 pub(crate) enum PyOut<'py> {
-    U8(PyReadwriteArray3<'py, u8>),
+    #[pyo3(transparent)]
     U16(PyReadwriteArray3<'py, u16>),
+    #[pyo3(transparent)]
+    U8(PyReadwriteArray3<'py, u8>),
+    #[pyo3(transparent)]
     F32(PyReadwriteArray3<'py, f32>),
+    #[pyo3(transparent)]
     F64(PyReadwriteArray3<'py, f64>),
 }
 

@@ -24,12 +24,16 @@ use pyo3::prelude::*;
 use crate::arrays::image;
 use crate::{errors, run};
 
-/// A raw frame of any type that cameras deliver.
+/// A raw frame of any type that cameras deliver, the most frequent first: each type that does not fit takes time.
 #[derive(FromPyObject)]
 pub(crate) enum PyFrame<'py> {
-    U8(PyReadonlyArray2<'py, u8>),
+    #[pyo3(transparent)]
     U16(PyReadonlyArray2<'py, u16>),
+    #[pyo3(transparent)]
+    U8(PyReadonlyArray2<'py, u8>),
+    #[pyo3(transparent)]
     F32(PyReadonlyArray2<'py, f32>),
+    #[pyo3(transparent)]
     F64(PyReadonlyArray2<'py, f64>),
 }
 

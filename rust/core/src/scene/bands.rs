@@ -27,6 +27,30 @@ macro_rules! bands {
 }
 pub(super) use bands;
 
+/// Defines a function that runs in the widest vector registers of the processor. A closure given to pulp is compiled for
+/// the narrowest, unless it is short.
+macro_rules! wide {
+    ($(#[$doc:meta])* $vis:vis fn $name:ident<$life:lifetime $(, $kind:ident: $bound:ident)?>(
+        $($argument:ident: $type:ty),* $(,)?
+    ) -> $output:ty $body:block) => {
+        $(#[$doc])*
+        $vis fn $name<$life $(, $kind: $bound)?>($($argument: $type),*) -> $output {
+            struct Call<$life $(, $kind: $bound)?> { $($argument: $type),* }
+            impl<$life $(, $kind: $bound)?> pulp::NullaryFnOnce for Call<$life $(, $kind)?> {
+                type Output = $output;
+
+                #[inline(always)]
+                fn call(self) -> $output {
+                    let Self { $($argument),* } = self;
+                    $body
+                }
+            }
+            pulp::Arch::new().dispatch(Call { $($argument),* })
+        }
+    };
+}
+pub(super) use wide;
+
 /// The sums of bands, added in the order of the bands.
 pub(super) fn fold<const N: usize>(sums: Vec<[f64; N]>) -> [f64; N] {
     sums.into_iter().fold([0.0; N], |total, each| std::array::from_fn(|i| total[i] + each[i]))

@@ -1,8 +1,8 @@
 //! Gain and offset of each pixel, and the gauge that holds their means.
 
-use super::bands::{BAND, bands, fold};
+use super::bands::{BAND, bands, fold, wide};
 use crate::frames::Shape;
-use crate::parallel::Workers;
+use crate::parallel::{Workers, dot};
 
 /// Coefficients of the corrected frame X = g y + o, for values y on the scale [0, 1].
 #[derive(Clone, Debug)]
@@ -29,10 +29,7 @@ impl Coefficients {
         let size = BAND * self.shape.cols;
         workers.map_blocks(corrected, size, |index, corrected| {
             let start = index * size;
-            let pixels = raw[start..].iter().zip(&self.gain[start..]).zip(&self.offset[start..]);
-            for (corrected, ((y, gain), offset)) in corrected.iter_mut().zip(pixels) {
-                *corrected = gain * y + offset;
-            }
+            applied(&raw[start..], &self.gain[start..], &self.offset[start..], corrected);
         });
     }
 
@@ -47,8 +44,7 @@ impl Coefficients {
             [size, size],
             |index, gain, offset| {
                 let part = &part[index * size..][..gain.len()];
-                let taken: f64 = gain.iter().zip(part).map(|(g, part)| f64::from(g * part)).sum();
-                [sum(gain), sum(offset), taken, sum(part)]
+                [sum(gain), sum(offset), dot(gain, part), sum(part)]
             },
         );
         let [gains, offsets, taken, parts] = fold(sums);
@@ -57,10 +53,7 @@ impl Coefficients {
             let shift = (offsets / parts) as f32;
             let parts = bands!(size; &mut self.gain, &mut self.offset);
             workers.each(parts, |index, (gain, offset)| {
-                for ((g, o), part) in gain.iter_mut().zip(offset).zip(&part[index * size..]) {
-                    *g += factor * part * *g;
-                    *o -= shift * part;
-                }
+                give_back(gain, offset, &part[index * size..], [factor, shift]);
             });
         }
         self.hold_gauge(workers);
@@ -82,23 +75,53 @@ impl Coefficients {
         let (factor, shift) = ((1.0 / taken.scale) as f32, taken.shift as f32);
         let parts = bands!(size; &mut self.gain, &mut self.offset);
         workers.each(parts, |_, (gain, offset)| {
-            for (g, o) in gain.iter_mut().zip(offset) {
-                *g *= factor;
-                *o = (*o - shift) * factor;
-            }
+            scale(gain, offset, [factor, shift]);
         });
         taken
     }
 }
 
-/// The sum of values in single precision.
-pub(super) fn sum(values: &[f32]) -> f64 {
-    sum_of(values, |value| value)
+wide! {
+/// Writes g y + o.
+fn applied<'s>(raw: &'s [f32], gain: &'s [f32], offset: &'s [f32], corrected: &'s mut [f32]) -> () {
+    for (corrected, ((y, gain), offset)) in corrected.iter_mut().zip(raw.iter().zip(gain).zip(offset)) {
+        *corrected = gain * y + offset;
+    }
+}
 }
 
+wide! {
+/// g ← g + factor part g, o ← o − shift part.
+fn give_back<'s>(gain: &'s mut [f32], offset: &'s mut [f32], part: &'s [f32], by: [f32; 2]) -> () {
+    for ((g, o), part) in gain.iter_mut().zip(offset).zip(part) {
+        *g += by[0] * part * *g;
+        *o -= by[1] * part;
+    }
+}
+}
+
+wide! {
+/// g ← factor g, o ← (o − shift) factor.
+fn scale<'s>(gain: &'s mut [f32], offset: &'s mut [f32], by: [f32; 2]) -> () {
+    for (g, o) in gain.iter_mut().zip(offset) {
+        *g *= by[0];
+        *o = (*o - by[1]) * by[0];
+    }
+}
+}
+
+wide! {
+/// The sum of values in single precision.
+pub(super) fn sum<'s>(values: &'s [f32]) -> f64 {
+    sum_of(values, |value| value)
+}
+}
+
+wide! {
 /// The sum of the squares of values.
-pub(super) fn sum_of_squares(values: &[f32]) -> f64 {
+pub(super) fn sum_of_squares<'s>(values: &'s [f32]) -> f64 {
     sum_of(values, |value| value * value)
+}
 }
 
 #[inline(always)]

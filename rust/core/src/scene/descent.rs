@@ -18,7 +18,7 @@
 //!    of their products. What persists is the pattern, which is to be learned by long steps, and the share is what
 //!    moves of it for each part that persists. Updates that follow one another have a frame in common.
 
-use super::bands::{BAND, bands, fold};
+use super::bands::{BAND, bands, fold, wide};
 use super::coefficients::{Coefficients, sum_of_squares};
 use super::method::step_at;
 use super::state::State;
@@ -79,9 +79,7 @@ impl Descent {
         let squares = workers.map_blocks(&mut self.before[0], size, |index, before| {
             let errors = &errors[index * size..][..before.len()];
             let total = sum_of_squares(before) + sum_of_squares(errors);
-            for (before, error) in before.iter_mut().zip(errors) {
-                *before -= error;
-            }
+            subtract(before, errors);
             let apart = sum_of_squares(before);
             before.copy_from_slice(errors);
             [apart, (total - apart) / 2.0]
@@ -106,17 +104,10 @@ impl Descent {
             part.fill(0.0);
             for pull in pulls {
                 let start = index * BAND * cols;
-                let values = pull.raw[start..].iter().zip(&pull.errors[start..]);
-                let values = values.zip(&pull.part[start..]);
-                let pixels = gain.iter_mut().zip(offset.iter_mut()).zip(part.iter_mut());
-                for (((gain, offset), part), ((y, error), taken)) in pixels.zip(values) {
-                    let depth = y - centre;
-                    let step = step_at(step, depth);
-                    let change = step * error;
-                    *gain += change * depth;
-                    *offset += change - centre * change * depth;
-                    *part += step * taken;
-                }
+                let [raw, errors, taken] =
+                    [pull.raw, pull.errors, pull.part].map(|each| &each[start..]);
+                let pull = Pull { raw, errors, part: taken };
+                descend(pull, [step, centre], gain, offset, part);
             }
         });
         to.hold_gauge_by(&self.part, workers);
@@ -133,6 +124,33 @@ impl Descent {
             .count("frames_of_centre", &mut self.frames)
             .count("updates", &mut self.updates)
     }
+}
+
+wide! {
+fn subtract<'s>(values: &'s mut [f32], others: &'s [f32]) -> () {
+    for (value, other) in values.iter_mut().zip(others) {
+        *value -= other;
+    }
+}
+}
+
+wide! {
+/// Changes coefficients by a pull, and adds the step to the part of each pixel.
+fn descend<'s>(
+    pull: Pull<'s>, by: [f32; 2], gain: &'s mut [f32], offset: &'s mut [f32], part: &'s mut [f32],
+) -> () {
+    let [step, centre] = by;
+    let values = pull.raw.iter().zip(pull.errors).zip(pull.part);
+    let pixels = gain.iter_mut().zip(offset).zip(part);
+    for (((gain, offset), part), ((y, error), taken)) in pixels.zip(values) {
+        let depth = y - centre;
+        let step = step_at(step, depth);
+        let change = step * error;
+        *gain += change * depth;
+        *offset += change - centre * change * depth;
+        *part += step * taken;
+    }
+}
 }
 
 #[cfg(test)]

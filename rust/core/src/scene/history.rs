@@ -1,6 +1,6 @@
 //! Mean and variance of each pixel over time: they tell pixels that do not respond.
 
-use super::bands::{BAND, bands};
+use super::bands::{BAND, bands, wide};
 use super::coefficients::sum;
 use crate::frames::Shape;
 use crate::parallel::Workers;
@@ -27,12 +27,7 @@ impl History {
         let size = BAND * self.cols;
         let bands = bands!(size; &mut self.mean, &mut self.variance);
         workers.each(bands, |index, (means, variances)| {
-            let pixels = means.iter_mut().zip(variances);
-            for ((mean, variance), y) in pixels.zip(&raw[index * size..]) {
-                let change = y - *mean;
-                *mean += share * change;
-                *variance = (1.0 - share) * (*variance + share * change * change);
-            }
+            follow(means, variances, &raw[index * size..], share);
         });
     }
 
@@ -44,6 +39,17 @@ impl History {
     pub(super) fn deviation(&self) -> Vec<f32> {
         self.variance.iter().map(|variance| variance.sqrt()).collect()
     }
+}
+
+wide! {
+/// Mean and variance with one more value, which has a share of all.
+fn follow<'s>(means: &'s mut [f32], variances: &'s mut [f32], raw: &'s [f32], share: f32) -> () {
+    for ((mean, variance), y) in means.iter_mut().zip(variances).zip(raw) {
+        let change = y - *mean;
+        *mean += share * change;
+        *variance = (1.0 - share) * (*variance + share * change * change);
+    }
+}
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! Images moved by a fraction of a pixel, S, and the transposed move Sᵀ.
 
-use super::bands::{fold, mirrored};
+use super::bands::{fold, mirrored, wide};
 use super::coefficients::{sum, sum_of_squares};
 use super::spline::{REACH, cardinal, prefilter, scale_edges};
 use crate::frames::Shape;
@@ -46,14 +46,11 @@ impl Move {
         let cols = shape.cols;
         let lines: [&[f32]; 4] = std::array::from_fn(|tap| {
             let line = mirrored(row as isize + self.whole[0] + tap as isize - 1, shape.rows);
-            &coefficients[line * cols..(line + 1) * cols]
+            &coefficients[line * cols..][..cols]
         });
-        let [first, _] = &self.taps;
-        for (col, value) in padded[1..=cols].iter_mut().enumerate() {
-            *value = first[0] * lines[0][col]
-                + first[1] * lines[1][col]
-                + first[2] * lines[2][col]
-                + first[3] * lines[3][col];
+        let ([first, _], [a, b, c, d]) = (&self.taps, lines);
+        for (col, value) in padded[1..][..cols].iter_mut().enumerate() {
+            *value = first[0] * a[col] + first[1] * b[col] + first[2] * c[col] + first[3] * d[col];
         }
         padded[0] = padded[1 + mirrored(-1, cols)];
         padded[cols + 1] = padded[1 + mirrored(cols as isize, cols)];
@@ -142,6 +139,26 @@ impl Move {
     }
 }
 
+wide! {
+/// [`Move::row`].
+fn moved_row<'s>(
+    way: &'s Move, shape: Shape, from: (&'s [f32], usize), padded: &'s mut [f32], values: &'s mut [f32],
+) -> () {
+    way.row(shape, from.0, from.1, padded, values);
+}
+}
+
+wide! {
+/// Writes a row of coefficients that an image is scattered to.
+fn scatter<'s>(
+    way: &'s Move, shape: Shape, image: (&'s [f32], usize), line: &'s mut [f32], padded: &'s mut [f32],
+    values: &'s mut [f32],
+) -> () {
+    way.gather(shape, image.0, image.1, line);
+    way.spread(line, padded, values);
+}
+}
+
 /// Writes Sᵀ of an image that is 0 where the move is not inside: taps are scattered to coefficients, then the
 /// transposed filter is applied. `scratch` is two images.
 pub(super) fn transposed(
@@ -157,10 +174,7 @@ pub(super) fn transposed(
         let (mut line, mut padded) = (vec![0.0; cols], vec![0.0; cols + 3]);
         for (row, values) in band.chunks_mut(cols).enumerate() {
             line.fill(0.0);
-            pulp::Arch::new().dispatch(|| {
-                way.gather(shape, image, index * BAND + row, &mut line);
-                way.spread(&line, &mut padded, values);
-            });
+            scatter(way, shape, (image, index * BAND + row), &mut line, &mut padded, values);
         }
     });
     scale_edges(shape, scattered, 2.0);
@@ -208,7 +222,7 @@ pub(super) fn difference(
             if !rows.contains(&row) {
                 continue;
             }
-            pulp::Arch::new().dispatch(|| way.row(shape, coefficients, row, &mut padded, values));
+            moved_row(way, shape, (coefficients, row), &mut padded, values);
             let values = &mut values[columns.clone()];
             for (value, own) in values.iter_mut().zip(&own.values[row * cols..][columns.clone()]) {
                 *value -= own;

@@ -42,6 +42,9 @@ const PLACES: usize = 1024;
 #[derive(Debug)]
 pub(super) struct PhaseCorrelation {
     most: isize,
+    /// Frequencies along the columns, and those along the rows from the lowest.
+    cols: Vec<f64>,
+    rows: Vec<f64>,
     /// Entries of the spectrum, and their frequencies in radians per pixel.
     entries: Vec<(usize, [f64; 2])>,
 }
@@ -62,7 +65,10 @@ impl PhaseCorrelation {
         let largest = 2.0 * std::f64::consts::PI * cutoff;
         let used = |[u, v]: [f64; 2]| (v > 0.0 || u > 0.0) && u.hypot(v) < largest;
         let entries = (0..lines * cols).map(|entry| (entry, transform.frequency(entry)));
-        Self { most: most as isize, entries: entries.filter(|(_, f)| used(*f)).collect() }
+        let entries = entries.filter(|(_, f)| used(*f)).collect();
+        let rows = (0..lines).map(|line| transform.frequency(line * cols)[0]).collect();
+        let cols = (0..cols).map(|col| transform.frequency(col)[1]).collect();
+        Self { most: most as isize, cols, rows, entries }
     }
 
     /// The mean cosine that the best shift between frames of different scenes exceeds with the probability
@@ -98,7 +104,8 @@ impl PhaseCorrelation {
                 break;
             }
         }
-        let left = phases.iter().zip(&self.entries).map(|(p, (_, f))| turned(*p, *f, pixels)[0]);
+        let turns = self.turns(pixels);
+        let left = phases.iter().zip(&self.entries).map(|(p, (i, _))| turned(*p, turns(*i))[0]);
         let agreement = left.sum::<f64>() / phases.len() as f64;
         let shows = self.shows(before, after, pixels);
         Shift { pixels, agreement, shows }
@@ -108,13 +115,14 @@ impl PhaseCorrelation {
     /// that stands still, wholly or half, a shift explains nothing.
     fn shows(&self, before: &Spectrum, after: &Spectrum, pixels: [f64; 2]) -> bool {
         let (mut power, mut left, mut unmoved) = (0.0, 0.0, 0.0);
-        for (entry, frequency) in &self.entries {
+        let turns = self.turns(pixels);
+        for (entry, _) in &self.entries {
             let [a, b, c, d] =
                 [&before.re, &before.im, &after.re, &after.im].map(|v| f64::from(v[*entry]));
             let sum = a * a + b * b + c * c + d * d;
             let cross = [c * a + d * b, d * a - c * b];
             power += sum;
-            left += sum - 2.0 * turned(cross, *frequency, pixels)[0];
+            left += sum - 2.0 * turned(cross, turns(*entry))[0];
             unmoved += sum - 2.0 * cross[0];
         }
         left < MOST_LEFT * power && left < unmoved
@@ -122,38 +130,46 @@ impl PhaseCorrelation {
 
     /// The best of all whole shifts within reach.
     fn best_whole(&self, phases: &[[f64; 2]], workers: &Workers) -> [f64; 2] {
-        let shifts = |index: usize| index as isize - self.most;
-        let count = 2 * self.most as usize + 1;
-        let best = workers.map(count, |col| {
-            let lines = self.summed_along_cols(phases, shifts(col) as f64);
+        let shifts: Vec<_> = (-self.most..=self.most).map(|shift| shift as f64).collect();
+        let rows: Vec<_> = shifts.iter().map(|row| factors(&self.rows, *row)).collect();
+        let best = workers.map(shifts.len(), |col| {
+            let lines = self.summed_along_cols(phases, shifts[col]);
             let height = |row: usize| {
-                let row = [shifts(row) as f64, 0.0];
-                let terms = lines.iter().map(|(u, sum)| turned(*sum, [*u, 0.0], row)[0]);
-                (terms.sum::<f64>(), [row[0], shifts(col) as f64])
+                let terms = lines.iter().zip(&rows[row]).map(|(sum, by)| turned(*sum, *by)[0]);
+                (terms.sum::<f64>(), [shifts[row], shifts[col]])
             };
-            (0..count).map(height).fold((f64::NEG_INFINITY, [0.0; 2]), higher)
+            (0..shifts.len()).map(height).fold((f64::NEG_INFINITY, [0.0; 2]), higher)
         });
         best.into_iter().fold((f64::NEG_INFINITY, [0.0; 2]), higher).1
     }
 
     /// Σ over the frequencies along the columns, for each frequency along the rows.
-    fn summed_along_cols(&self, phases: &[[f64; 2]], col: f64) -> Vec<(f64, [f64; 2])> {
-        let mut lines: Vec<(f64, [f64; 2])> = Vec::new();
-        for (value, (_, frequency)) in phases.iter().zip(&self.entries) {
-            let [re, im] = turned(*value, [0.0, frequency[1]], [0.0, col]);
-            match lines.last_mut() {
-                Some((u, sum)) if *u == frequency[0] => *sum = [sum[0] + re, sum[1] + im],
-                _ => lines.push((frequency[0], [re, im])),
-            }
+    fn summed_along_cols(&self, phases: &[[f64; 2]], col: f64) -> Vec<[f64; 2]> {
+        let (mut lines, by) = (vec![[0.0; 2]; self.rows.len()], factors(&self.cols, col));
+        for (value, (entry, _)) in phases.iter().zip(&self.entries) {
+            let [re, im] = turned(*value, by[entry % by.len()]);
+            let sum = &mut lines[entry / by.len()];
+            *sum = [sum[0] + re, sum[1] + im];
         }
         lines
+    }
+
+    /// exp(i f·d) of each entry of a spectrum, as the product of those along both axes: as many as a side has pixels are
+    /// computed, not as many as the array has.
+    fn turns(&self, [row, col]: [f64; 2]) -> impl Fn(usize) -> [f64; 2] {
+        let (rows, cols) = (factors(&self.rows, row), factors(&self.cols, col));
+        move |entry| {
+            let ([a, b], [c, d]) = (rows[entry / cols.len()], cols[entry % cols.len()]);
+            [a * c - b * d, a * d + b * c]
+        }
     }
 
     /// A Newton step to the maximum, if the curvature has one.
     fn newton(&self, phases: &[[f64; 2]], pixels: [f64; 2]) -> [f64; 2] {
         let (mut slope, mut curvature) = ([0.0; 2], [0.0; 3]);
-        for (value, (_, [u, v])) in phases.iter().zip(&self.entries) {
-            let [re, im] = turned(*value, [*u, *v], pixels);
+        let turns = self.turns(pixels);
+        for (value, (entry, [u, v])) in phases.iter().zip(&self.entries) {
+            let [re, im] = turned(*value, turns(*entry));
             slope = [slope[0] + u * im, slope[1] + v * im];
             curvature =
                 [curvature[0] + u * u * re, curvature[1] + v * v * re, curvature[2] + u * v * re];
@@ -184,9 +200,14 @@ fn phase(before: &Spectrum, after: &Spectrum, entry: usize) -> [f64; 2] {
     [re / size, im / size]
 }
 
-/// value · exp(−i f·d).
-fn turned([re, im]: [f64; 2], [u, v]: [f64; 2], [row, col]: [f64; 2]) -> [f64; 2] {
-    let (sin, cos) = (u * row + v * col).sin_cos();
+/// exp(i f d) of some frequencies.
+fn factors(frequencies: &[f64], shift: f64) -> Vec<[f64; 2]> {
+    let factor = |f: &f64| [(f * shift).cos(), (f * shift).sin()];
+    frequencies.iter().map(factor).collect()
+}
+
+/// value / factor, of a factor of size 1.
+fn turned([re, im]: [f64; 2], [cos, sin]: [f64; 2]) -> [f64; 2] {
     [re * cos + im * sin, im * cos - re * sin]
 }
 
@@ -222,7 +243,9 @@ mod tests {
         for wanted in [[0.5, -1.5], [2.4, 0.6], [-0.3, 3.7]] {
             let moved = |i: usize| {
                 let value = [f64::from(before.re[i]), f64::from(before.im[i])];
-                turned(value, transform.frequency(i), wanted.map(|shift: f64| -shift))
+                let [u, v] = transform.frequency(i);
+                let angle = u * wanted[0] + v * wanted[1];
+                turned(value, [angle.cos(), -angle.sin()])
             };
             let after = Spectrum {
                 re: (0..count).map(|i| moved(i)[0] as f32).collect(),

@@ -7,6 +7,7 @@
 
 use std::f64::consts::PI;
 
+use super::bands::wide;
 use crate::frames::Shape;
 use crate::parallel::Workers;
 
@@ -91,10 +92,9 @@ impl Transform {
         // A row of amplitudes: count real parts, then as many imaginary ones.
         let mut lines = vec![0.0_f32; self.shape.rows * 2 * count];
         workers.map_blocks(&mut lines, LINES * 2 * count, |index, lines| {
-            pulp::Arch::new().dispatch(|| self.along_cols(image, mean, index * LINES, lines));
+            along_cols(self, image, mean, index * LINES, lines);
         });
-        let found = workers
-            .map(self.rows.count, |k| pulp::Arch::new().dispatch(|| self.along_rows(&lines, k)));
+        let found = workers.map(self.rows.count, |k| along_rows(self, &lines, k));
         let mut spectrum = Spectrum::default();
         let negative = found[1..].iter().rev().map(|[_, minus]| minus);
         for values in negative.chain(found.iter().map(|[plus, _]| plus)) {
@@ -164,6 +164,20 @@ impl Transform {
             (0..width).map(|i| even[i] + turn(i)).collect()
         })
     }
+}
+
+wide! {
+/// [`Transform::along_cols`].
+fn along_cols<'s>(by: &'s Transform, image: &'s [f32], mean: f32, first: usize, lines: &'s mut [f32]) -> () {
+    by.along_cols(image, mean, first, lines);
+}
+}
+
+wide! {
+/// [`Transform::along_rows`].
+fn along_rows<'s>(by: &'s Transform, lines: &'s [f32], k: usize) -> [Vec<f32>; 2] {
+    by.along_rows(lines, k)
+}
 }
 
 #[cfg(test)]

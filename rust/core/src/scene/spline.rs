@@ -5,7 +5,7 @@
 //! (1999) 22–38). A band of rows starts it 14 rows earlier: z¹⁴ = 1e-8 is below the rounding of single
 //! precision, so bands do not depend on each other.
 
-use super::bands::mirrored;
+use super::bands::{mirrored, wide};
 use crate::frames::Shape;
 use crate::parallel::Workers;
 
@@ -16,7 +16,10 @@ const POLE: f32 = -0.267_949_2;
 pub(super) const REACH: usize = 14;
 
 /// Rows that are filtered side by side along the columns.
-const LANES: usize = 8;
+const LANES: usize = 16;
+
+/// Columns that are filtered side by side along the rows: with those of a band they stay in the first cache.
+const STRIP: usize = 64;
 
 /// Rows of a band that is filtered along the rows.
 const BAND: usize = 64;
@@ -40,22 +43,31 @@ pub(super) fn prefilter(
     let cols = shape.cols;
     workers.map_blocks(along, LANES * cols, |index, lines| {
         let start = index * LANES * cols;
-        pulp::Arch::new()
-            .dispatch(|| filter_lines(&values[start..start + lines.len()], lines, cols));
+        filter_lines(&values[start..start + lines.len()], lines, cols);
     });
     let along = &*along;
     workers.map_blocks(coefficients, BAND * cols, |index, band| {
-        pulp::Arch::new().dispatch(|| filter_band(shape, along, index * BAND, band));
+        filter_band(shape, along, index * BAND, band);
     });
 }
 
-/// Filters up to eight rows along the columns.
-#[inline(always)]
-fn filter_lines(values: &[f32], lines: &mut [f32], cols: usize) {
+wide! {
+/// Filters up to `LANES` rows along the columns.
+fn filter_lines<'s>(values: &'s [f32], lines: &'s mut [f32], cols: usize) -> () {
     let mut wide = vec![[0.0_f32; LANES]; cols + 2 * REACH];
+    let (before, rest) = wide.split_at_mut(REACH);
+    let (inside, after) = rest.split_at_mut(cols);
     for (lane, line) in values.chunks(cols).enumerate() {
-        for (i, wide) in wide.iter_mut().enumerate() {
-            wide[lane] = line[mirrored(i as isize - REACH as isize, cols)];
+        for i in 0..REACH {
+            before[i][lane] = line[mirrored(i as isize - REACH as isize, cols)];
+            after[i][lane] = line[mirrored((cols + i) as isize, cols)];
+        }
+    }
+    for (index, block) in inside.chunks_mut(LANES).enumerate() {
+        for (lane, line) in values.chunks(cols).enumerate() {
+            for (wide, value) in block.iter_mut().zip(&line[index * LANES..]) {
+                wide[lane] = *value;
+            }
         }
     }
     let mut last = [0.0_f32; LANES];
@@ -72,40 +84,47 @@ fn filter_lines(values: &[f32], lines: &mut [f32], cols: usize) {
         }
         *value = last;
     }
-    for (lane, line) in lines.chunks_mut(cols).enumerate() {
-        for (value, wide) in line.iter_mut().zip(&wide[REACH..]) {
-            *value = 6.0 * wide[lane];
-        }
-    }
-}
-
-/// Filters the columns of a band of rows.
-#[inline(always)]
-fn filter_band(shape: Shape, along: &[f32], first: usize, band: &mut [f32]) {
-    let cols = shape.cols;
-    let rows = band.len() / cols + 2 * REACH;
-    let mut wide = vec![0.0_f32; rows * cols];
-    let mut last = vec![0.0_f32; cols];
-    for (i, line) in wide.chunks_mut(cols).enumerate() {
-        let row = mirrored((first + i) as isize - REACH as isize, shape.rows);
-        let values = &along[row * cols..(row + 1) * cols];
-        for ((last, value), line) in last.iter_mut().zip(values).zip(line) {
-            *last = value + POLE * *last;
-            *line = *last;
-        }
-    }
-    last.fill(0.0);
-    for (i, line) in wide.chunks(cols).enumerate().rev() {
-        for (last, value) in last.iter_mut().zip(line) {
-            *last = POLE * (*last - value);
-        }
-        if i >= REACH && i < rows - REACH {
-            let start = (i - REACH) * cols;
-            for (value, last) in band[start..start + cols].iter_mut().zip(&last) {
-                *value = 6.0 * last;
+    for (index, block) in wide[REACH..REACH + cols].chunks(LANES).enumerate() {
+        for (lane, line) in lines.chunks_mut(cols).enumerate() {
+            for (value, wide) in line[index * LANES..].iter_mut().zip(block) {
+                *value = 6.0 * wide[lane];
             }
         }
     }
+}
+}
+
+wide! {
+/// Filters the columns of a band of rows.
+fn filter_band<'s>(shape: Shape, along: &'s [f32], first: usize, band: &'s mut [f32]) -> () {
+    let cols = shape.cols;
+    let rows = band.len() / cols + 2 * REACH;
+    let mut wide = vec![[0.0_f32; STRIP]; rows];
+    for start in (0..cols).step_by(STRIP) {
+        let width = STRIP.min(cols - start);
+        let mut last = [0.0_f32; STRIP];
+        for (i, line) in wide.iter_mut().enumerate() {
+            let row = mirrored((first + i) as isize - REACH as isize, shape.rows);
+            let values = &along[row * cols + start..][..width];
+            for (last, value) in last.iter_mut().zip(values) {
+                *last = value + POLE * *last;
+            }
+            *line = last;
+        }
+        last = [0.0; STRIP];
+        for (i, line) in wide.iter().enumerate().rev() {
+            for (last, value) in last.iter_mut().zip(line) {
+                *last = POLE * (*last - value);
+            }
+            if i >= REACH && i < rows - REACH {
+                let values = &mut band[(i - REACH) * cols + start..][..width];
+                for (value, last) in values.iter_mut().zip(&last) {
+                    *value = 6.0 * last;
+                }
+            }
+        }
+    }
+}
 }
 
 /// Multiplies the first and the last row by a factor, then the first and the last column.
