@@ -19,6 +19,7 @@ import large
 import levels
 import multiscale
 import numpy as np
+import patterns
 import planning
 import reporting
 import response
@@ -26,6 +27,7 @@ import subpixel
 import uncertainty
 from peers import table as peers
 
+import batch
 import equipix
 import experiment
 import scene
@@ -49,9 +51,12 @@ def main(*, smoke: bool) -> None:
     small = (((96, 128), 1, 1),)
     rows += experiment.large_rows(small) if smoke else experiment.large_rows()
     rows += large.rows((96, 128)) if smoke else large.rows()
+    rows += patterns.rows((96, 128), patterns=1) if smoke else patterns.rows()
     rows += planning.rows((96, 128), travel=20) if smoke else planning.rows()
     rows += levels.rows((96, 128), frames=3) if smoke else levels.rows()
     rows += reporting.rows((96, 128)) if smoke else reporting.rows()
+    lot = {"shape": (96, 128), "sensors": 2, "frames": 2, "repetitions": 1}
+    rows += batch.rows(**lot) if smoke else batch.rows()
     rows += averaging.rows(frames=3, repetitions=1) if smoke else averaging.rows()
     rows += response.rows(shape=(24, 32), repetitions=1) if smoke else response.rows()
     rows += scene.rows(shape=(48, 64), frames=3, passes=1) if smoke else scene.rows()
