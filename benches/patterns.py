@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from commands import Row
 
 CROSS = equipix.cross_pattern(11, 19)
-COUNTS, TRAVELS = (5, 6, 7, 9, 20), (30, 100, 200)
+COUNTS = 5, 6, 7, 9, 20
 MOST_PRODUCTS, MOST_TIMES = {9: 40, 20: 40, 7: 60}, {5: 4.0, 6: 4.0}
 """Products in 95 of 100 fits, and the time over that of the cross in 90 of 100."""
 TOLERANCE = 1e-6
@@ -33,10 +33,15 @@ class Taken(NamedTuple):
     converged: bool
 
 
-def rows(shape: tuple[int, int] = (582, 782), *, patterns: int = 100) -> list[Row]:
+def rows(
+    shape: tuple[int, int] = (582, 782),
+    *,
+    travels: tuple[int, ...] = (30, 100, 200),
+    patterns: int = 100,
+) -> list[Row]:
     """Fit each pattern, and the cross in turn with them."""
     found = []
-    for count, travel in itertools.product(COUNTS, TRAVELS):
+    for count, travel in itertools.product(COUNTS, travels):
         rng = np.random.default_rng([count, travel])
         fits, cross = [], []
         for number in range(patterns):
@@ -45,7 +50,7 @@ def rows(shape: tuple[int, int] = (582, 782), *, patterns: int = 100) -> list[Ro
             fits.append(fit(shape, determined(shape, count, travel, rng)))
         found.append(row(f"{count} positions within ± {travel}", count, fits, cross))
     for count in (5, 6):
-        for travel in TRAVELS:
+        for travel in travels:
             # A stage of travel ± t moves by 2 t in all.
             proposed = plan.suggest(shape, count, 2 * travel, patterns=1)[0].shifts
             fits = [fit(shape, each) for each in (proposed, CROSS) * 3]

@@ -51,7 +51,8 @@ def main(*, smoke: bool) -> None:
     small = (((96, 128), 1, 1),)
     rows += experiment.large_rows(small) if smoke else experiment.large_rows()
     rows += large.rows((96, 128)) if smoke else large.rows()
-    rows += patterns.rows((96, 128), patterns=1) if smoke else patterns.rows()
+    few = {"travels": (20,), "patterns": 1}
+    rows += patterns.rows((96, 128), **few) if smoke else patterns.rows()
     rows += planning.rows((96, 128), travel=20) if smoke else planning.rows()
     rows += levels.rows((96, 128), frames=3) if smoke else levels.rows()
     rows += reporting.rows((96, 128)) if smoke else reporting.rows()
