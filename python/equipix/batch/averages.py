@@ -12,7 +12,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from equipix._check import Array, ArrayLike, Progress, as_floats, as_level, as_mask
+from equipix._check import (
+    Array,
+    ArrayLike,
+    Progress,
+    as_floats,
+    as_level,
+    as_mask,
+    positive_workers,
+)
 from equipix.batch.memory import PROCESS
 from equipix.batch.series import Frames, Piece, Series, key_of, series_at
 from equipix.errors import FileError, InputError
@@ -96,6 +104,7 @@ def average(
     files = frame_files([frames] if isinstance(frames, str | PathLike) else frames)
     offset = dark if isinstance(dark, FrameStatistics | None) else as_floats("dark", dark, ndim=2)
     place = as_path("work", work)
+    positive_workers(workers)
     with series_at(scheduler, place, memory_of(files), workers, progress) as series:
         hashes = sha256_of([file.path for file in files], series.digests)
         found = average_in(series, files, hashes, dark=offset, saturation=saturation, mask=mask)
@@ -134,6 +143,7 @@ def average_in(
     ]
     left = [job for job in jobs if _read(job.target) is None]
     series.results(_sum, left, memory_of(files)[0], "average")
+    series.refuse_changed([job.target for job in jobs])
     sums = RunningAverage(np.empty((0, *frames.shape), frames.dtype), level, excluded)
     for job in jobs:
         state = _read(job.target)
@@ -186,7 +196,9 @@ class _Job(NamedTuple):
 def _sum(job: _Job, workers: int | None) -> int:
     """Sum a piece and write the sums, their checksum first."""
     given = batches(frame for frames in job.piece.frames(workers) for frame in frames)
-    first = next(given)
+    first = next(given, None)
+    if first is None:
+        raise FileError(f"{job.piece.parts[0][0]}: has changed meanwhile: call again")
     mask = None if job.mask is None else np.load(job.mask)
     sums = RunningAverage(first, job.level, mask, workers)
     for batch in chain([first], given):

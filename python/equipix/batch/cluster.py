@@ -1,8 +1,10 @@
 """Tasks on the workers of dask.distributed, each when the memory for it is free."""
 
 import os
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from threading import Lock
 from typing import Any, NamedTuple, TypeVar
 
 from equipix.errors import EquipixError
@@ -38,26 +40,33 @@ def finished(
     left = {task.job.name: task for task in sorted(tasks, key=lambda task: -task.memory)}
     if not left:
         return
+    most = max(task.memory for task in tasks)
     with scheduler_at(scheduler, [task.memory for task in tasks], workers) as address:
-        for _ in range(_ROUNDS):
+        reason = f"the scheduler ended {_ROUNDS} times"
+        for number in range(_ROUNDS):
             if not left:
                 return
-            with _client(address) as client:
-                for task, found in _round(client, work, [*left.values()]):
-                    del left[task.job.name]
-                    yield task, found
+            try:
+                with _client(address) as client:
+                    largest = _largest(client, 0 if scheduler is None else most)
+                    for task, found in _round(client, work, [*left.values()], largest):
+                        del left[task.job.name]
+                        yield task, found
+            except EquipixError as error:
+                if not number:
+                    raise
+                reason = f"the scheduler ended: {error}"
+                break
     for task in left.values():
-        yield task, f"the scheduler ended {_ROUNDS} times"
+        yield task, reason
 
 
 def _round(
-    client: Any, work: Callable[[Any, int | None], _Result], tasks: list[Task]
+    client: Any, work: Callable[[Any, int | None], _Result], tasks: list[Task], largest: int
 ) -> Iterator[tuple[Task, _Result | str]]:
     """Tasks that are finished until the scheduler ends."""
     from distributed import as_completed
 
-    _wait(client)
-    largest = _largest(client)
     sent: dict[Any, Task] = {}
     for task in tasks:
         if task.memory > largest:
@@ -86,7 +95,7 @@ def _in_words(error: BaseException) -> str:
 
     if isinstance(error, KilledWorker):
         return "the processes that worked on it ended again and again, perhaps for lack of memory"
-    return f"the worker could not begin: {type(error).__name__}: {error}"
+    return f"the worker ended with {type(error).__name__}: {error}"
 
 
 def _wait(client: Any) -> None:
@@ -100,11 +109,15 @@ def _wait(client: Any) -> None:
         ) from error
 
 
+_ALONE = Lock()
+
+
 def _on_worker(work: Callable[[Any, int | None], _Result], job: Any) -> _Result:
-    """Do the work with as many threads as the worker has."""
+    """Do the work with as many threads as the worker has, and no other work in its process."""
     from distributed import get_worker
 
-    return work(job, get_worker().state.nthreads)
+    with _ALONE:
+        return work(job, get_worker().state.nthreads)
 
 
 @contextmanager
@@ -167,8 +180,17 @@ def _free_memory() -> int:
     return int(_SHARE * min(psutil.virtual_memory().available, MEMORY_LIMIT))
 
 
-def _largest(client: Any) -> int:
-    """Bytes of the largest worker."""
+def _largest(client: Any, wanted: int) -> int:
+    """Bytes of the largest worker, once one has as many as wanted, or none has come for long."""
+    _wait(client)
+    end = time.monotonic() + _TIMEOUT_S
+    while (largest := _declared(client)) < wanted and time.monotonic() < end:
+        time.sleep(0.5)
+    return largest
+
+
+def _declared(client: Any) -> int:
+    """Bytes of the largest worker that is there."""
     workers = client.scheduler_info(n_workers=-1)["workers"].values()
     declared = [int(each["resources"].get(_MEMORY, 0)) for each in workers]
     if not any(declared):

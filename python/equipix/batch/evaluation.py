@@ -17,10 +17,10 @@ import numpy as np
 from equipix._check import LOG, Array, Bools
 from equipix._native import __version__
 from equipix.calibration.result import Calibration, refuse_partial
-from equipix.errors import EquipixError, EquipixWarning
+from equipix.errors import EquipixError, EquipixWarning, FileError
 from equipix.experiment.camera import CameraExperiment
 from equipix.experiment.experiment import Experiment
-from equipix.experiment.image_files import sha256_of
+from equipix.experiment.image_files import refuse_changed, sha256_of, state_of
 from equipix.experiment.level_experiment import LevelExperiment
 from equipix.experiment.manifest import kind_of
 from equipix.findings import Finding, Flag
@@ -119,11 +119,13 @@ def evaluate(job: Job, workers: int | None = None) -> Row:
     row = Row(job.name, str(job.manifest), host=platform.node())
     try:
         described = described_by(job.manifest)
+        states = {file: state_of(file) for file in [job.manifest, *described.files()]}
         key = key_of(job, described)
         before = _kept(job, key)
         if before is not None:
             return before
         found = replace(_evaluated(job, described, workers), key=key, host=row.host)
+        refuse_changed(states)
         found = replace(found, seconds=time.monotonic() - started)
         _write(job, found)
     except EquipixError as error:
@@ -162,15 +164,43 @@ def kept(job: Job, described: Described) -> Row | None:
 
 def _kept(job: Job, key: str) -> Row | None:
     """The row of before, if all that it names is there and of the same key."""
-    try:
-        content = checked(job.path(".json").read_text())
-        row = Row(**(content or {}))
-    except (OSError, ValueError, TypeError):
+    row = _before(job)
+    if row is None or row.key != key:
         return None
-    files = [job.output / name for name in (row.result, row.report) if name]
-    if row.key != key or not all(file.is_file() for file in files):
+    if not all((job.output / name).is_file() for name in (row.result, row.report) if name):
         return None
     return replace(row, manifest=str(job.manifest), status="kept")
+
+
+def _before(job: Job) -> Row | None:
+    """The row that was written before."""
+    try:
+        return Row(**(checked(job.path(".json").read_text()) or {}))
+    except (OSError, ValueError, TypeError):
+        return None
+
+
+def refuse_taken(job: Job) -> None:
+    """Refuse the name of another sensor, whose manifest is still there.
+
+    Raises
+    ------
+    FileError
+        If the folder holds a row of this name of another manifest.
+    """
+    before = _before(job)
+    if before is None or before.manifest == str(job.manifest):
+        return
+    if Path(before.manifest).exists():
+        raise FileError(
+            f"{job.path('.json')}: is that of {before.manifest}, but {job.manifest} has the same "
+            "name: choose another folder for one of them"
+        )
+
+
+def _forget(job: Job) -> None:
+    """Remove the row, which would stand beside a result that is not its own."""
+    job.path(".json").unlink(missing_ok=True)
 
 
 def _write(job: Job, row: Row) -> None:
@@ -192,6 +222,7 @@ def _evaluated(job: Job, described: Described, workers: int | None) -> Row:
     output, report = job.path(job.suffix), job.path(".html")
     if isinstance(result, Calibration) and not job.partial:
         refuse_partial(result, output)
+    _forget(job)
     result.save(output, force=True)
     part = part_of(job.name, result, job.limits)
     write_page(report, page([part], job.name), force=True)
@@ -205,6 +236,7 @@ def _camera(job: Job, camera: CameraExperiment, workers: int | None) -> Row:
     planes = camera.figures(workers=workers)
     judged = [camera_checks(found, job.limits.camera) for found in planes.values()]
     parts = camera_parts(job.name, planes, judged)
+    _forget(job)
     write_page(job.path(".html"), page(parts, job.name), force=True)
     figures = {
         f"{name}.{each.key}" if name else each.key: each.value

@@ -6,6 +6,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,6 +20,9 @@ from equipix.io.paths import write_whole
 from equipix.report.maps import Map
 from equipix.report.page import Part, Table, drawn, mapped, page, write_page
 from equipix.shown import Brief
+
+LOT = "lot"
+"""Name of the files of the lot, which no sensor has."""
 
 _MOST_TRENDS = 12
 """Most figures that are drawn over the lot."""
@@ -109,15 +113,17 @@ class Lot(Brief):
         EquipixError
             If pyarrow, jinja2 or matplotlib is not installed.
         """
+        refuse_no_parquet()
         columns, text = self.columns, io.StringIO(newline="")
         table = csv.writer(text)
         table.writerow(columns)
         table.writerows(zip(*columns.values(), strict=True))
-        with write_whole(folder / "lot.csv", force=True) as temporary:
-            temporary.write_text(text.getvalue(), newline="")
-        with write_whole(folder / "lot.parquet", force=True) as temporary:
+        with write_whole(folder / f"{LOT}.csv", force=True) as temporary:
+            temporary.write_text(text.getvalue(), encoding="utf-8", newline="")
+        with write_whole(folder / f"{LOT}.parquet", force=True) as temporary:
             _write_parquet(temporary, columns)
-        write_page(folder / "lot.html", page([self._part()], folder.resolve().name), force=True)
+        report = page([self._part()], folder.resolve().name)
+        write_page(folder / f"{LOT}.html", report, force=True)
 
     def _part(self) -> Part:
         """What the page says."""
@@ -227,13 +233,17 @@ def _draw(name: str, values: list[float | None], axes: Any) -> None:
     axes.set_title(name.replace("_", " "))
 
 
-def _write_parquet(path: Path, columns: dict[str, list[Any]]) -> None:
-    """Write a table of columns."""
-    try:
-        import pyarrow as pa
-        from pyarrow import parquet
-    except ImportError as error:
+def refuse_no_parquet() -> None:
+    """Refuse to begin without the library that writes the table."""
+    if find_spec("pyarrow") is None:
         raise EquipixError(
             "lot.parquet needs pyarrow, which is not installed: pip install 'equipix[batch]'"
-        ) from error
+        )
+
+
+def _write_parquet(path: Path, columns: dict[str, list[Any]]) -> None:
+    """Write a table of columns."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
     parquet.write_table(pa.table(columns), path)

@@ -3,10 +3,13 @@
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from equipix.batch.evaluation import Described
 from equipix.experiment.camera import CameraExperiment
 from equipix.experiment.experiment import Experiment
 from equipix.experiment.image_files import format_of
+from equipix.io.arrays import MOST_AT_ONCE, chunk_frames
 
 PROCESS = 300_000_000
 """Bytes of a process with all that it imports."""
@@ -17,11 +20,20 @@ def bytes_needed(described: Described, options: Mapping[str, Any]) -> int:
 
     Measured at 12 and 48 megapixels: 205 to 220 a pixel for five exposures between pixels.
     """
-    (rows, cols), _ = format_of(described.files()[0])
+    first = described.files()[0]
+    (rows, cols), dtype = format_of(first)
     pixels, count = rows * cols, len(described.manifest.measurements)
+    of_pixel = 150 + 16 * count + (112 if options.get("uncertainty") else 0)
     if isinstance(described, CameraExperiment):
-        return PROCESS + 60 * pixels
-    if not isinstance(described, Experiment):
-        return PROCESS + (100 + 16 * count) * pixels
-    of_error_map = 112 if options.get("uncertainty") else 0
-    return PROCESS + (150 + 16 * count + of_error_map) * pixels
+        of_pixel = 60
+    elif not isinstance(described, Experiment):
+        of_pixel = 100 + 16 * count
+    # What is read is no longer there when the frames are averaged.
+    frame = pixels * np.dtype(dtype).itemsize
+    return PROCESS + max(of_pixel * pixels, 20 * pixels + reading(frame, chunk_frames(first)))
+
+
+def reading(frame: int, chunk: int) -> int:
+    """Bytes that a process needs to read frames of so many bytes, and to copy them."""
+    chunk = chunk if chunk * frame <= MOST_AT_ONCE else 1
+    return 2 * max(chunk * frame, 2**27)

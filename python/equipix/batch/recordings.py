@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import shutil
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from equipix._check import Array, Flagged, OutputType, Progress
+from equipix._check import Array, Flagged, OutputType, Progress, positive_workers
 from equipix.batch.memory import PROCESS
 from equipix.batch.series import Frames, Piece, key_of, remove_work, series_at, work_beside
 from equipix.correction.apply import Corrector, output_dtype, usual_treatment
@@ -122,6 +123,7 @@ def correct(
     frames.
     """
     target = as_path("output", output)
+    positive_workers(workers)
     check_suffix(target, ZARR)
     files = find_files(frames)
     place = as_path("correction", correction)
@@ -182,9 +184,14 @@ def correct(
             array.create(shape, wanted, chunk, description=mark, history=history)
         left = [job for job in jobs if job.counts() is None]
         series.results(_corrected, left, memory[0], "correcting")
+        series.refuse_changed([job.mark for job in jobs])
         counts = _total(jobs)
         array.clean()
-        replace_folder(target, array.path)
+        # No later call looks for this name: the old recording may stand there when this one ends.
+        done = series.work / f"{key}.done"
+        shutil.rmtree(done, ignore_errors=True)
+        array.path.rename(done)
+        replace_folder(target, done)
     remove_work(target)
     lost = Counter({files[0]: counts["not_finite"]}) if counts["not_finite"] else Counter()
     said += warn_of_not_finite(lost, wanted)

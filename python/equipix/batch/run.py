@@ -8,10 +8,10 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from equipix._check import LOG, Progress
+from equipix._check import LOG, Progress, positive_workers
 from equipix.batch.cluster import Task, finished
-from equipix.batch.evaluation import Job, Row, described_by, evaluate, kept
-from equipix.batch.lot import Lot
+from equipix.batch.evaluation import Job, Row, described_by, evaluate, kept, refuse_taken
+from equipix.batch.lot import LOT, Lot, refuse_no_parquet
 from equipix.batch.memory import bytes_needed
 from equipix.errors import EquipixError, FileError, InputError
 from equipix.experiment.experiment import Experiment
@@ -74,15 +74,15 @@ def run(
     InputError
         If an option is unknown, a manifest is named twice, or `suffix` is no format.
     FileError
-        If `output` or `limits` cannot be used.
+        If `output` or `limits` cannot be used, or `output` holds another sensor of the same name.
     EquipixError
-        If dask.distributed is not installed, or the scheduler cannot be reached.
+        If dask.distributed or pyarrow is not installed, or the scheduler cannot be reached.
 
     Notes
     -----
-    The name of a sensor is the folder of its manifest, with the name of the file where several are
-    in one folder. A worker writes the result, then a page, then ``NAME.json``, each whole or not
-    at all. A sensor whose JSON file has the hash of its inputs, options, limits and version is
+    The name of a sensor is the folder of its manifest. Where two would have one name, all get the
+    name of the file or of folders above too. A worker writes the result, then a page, then
+    ``NAME.json``, each whole or not at all. A sensor whose JSON file has the hash of its inputs, options, limits and version is
     kept as it is: a lot that was interrupted goes on where it was. Nothing but rows travels through
     the scheduler. A worker takes a sensor when the memory for it is free, so that large ones go one
     at a time.
@@ -91,12 +91,16 @@ def run(
         known = ", ".join(sorted(_OPTIONS))
         raise InputError(f"'{unknown[0]}' is no option of a manifest, expected one of {known}")
     check_suffix(Path(f"result{suffix}"), SUFFIXES)
+    positive_workers(workers)
     wanted = read_limits(None if limits is None else as_path("limits", limits))
     folder = as_path("output", output)
     jobs = [
         Job(name, manifest, folder, suffix, options, wanted, partial)
         for name, manifest in _named([as_path("manifests", each) for each in manifests]).items()
     ]
+    for job in jobs:
+        refuse_taken(job)
+    refuse_no_parquet()
     _refuse_as_output(folder)
     found: dict[str, Row] = {}
     for row in _rows(jobs, scheduler, workers, progress):
@@ -117,7 +121,7 @@ def _named(manifests: list[Path]) -> dict[str, Path]:
     for parts in range(1, max(len(file.parts) for file in files)):
         for own in (False, True):
             names = ["-".join([*file.parent.parts[-parts:], *[file.stem] * own]) for file in files]
-            if len(set(names)) == len(files):
+            if len(set(names)) == len(files) and LOT not in names:
                 return dict(sorted(zip(names, files, strict=True)))
     raise InputError("two manifests differ by the letter / alone: rename a folder")
 

@@ -3,8 +3,9 @@
 import hashlib
 import json
 import math
+import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import cached_property, partial
 from pathlib import Path
@@ -15,9 +16,9 @@ import numpy as np
 from equipix._check import Array, Progress
 from equipix._native import __version__
 from equipix.batch.cluster import Task, finished, scheduler_at
-from equipix.batch.memory import PROCESS
+from equipix.batch.memory import PROCESS, reading
 from equipix.errors import EquipixError, FileError
-from equipix.experiment.image_files import digest
+from equipix.experiment.image_files import State, digest, refuse_changed, state_of
 from equipix.io.arrays import MOST_AT_ONCE, chunk_frames
 from equipix.io.formats import FrameFile
 from equipix.io.frames import stream_part
@@ -28,6 +29,9 @@ LOCAL = "local"
 
 _HASHED_AT_ONCE = 2**28
 """Bytes of files that one worker hashes at a time; at least a file is."""
+
+_OURS = re.compile(r"\.?[0-9a-f]{32}")
+"""Beginning of the names of pieces, and of files that are being written."""
 
 _Result = TypeVar("_Result")
 
@@ -91,7 +95,7 @@ class Frames:
     @property
     def reading(self) -> int:
         """Bytes that a process needs at most to read: frames at once, and a copy of them."""
-        return 2 * max(self.frame_bytes, min(self.chunk * self.frame_bytes, MOST_AT_ONCE), 2**27)
+        return reading(self.frame_bytes, self.chunk)
 
     def pieces(self, size: int) -> list[Piece]:
         """Give all frames in their order, in pieces of so many frames."""
@@ -134,6 +138,7 @@ class Series:
         progress: Progress | None = None,
     ) -> None:
         self.work, self._address, self._workers, self._progress = work, address, workers, progress
+        self._states: dict[Path, State | None] = {}
 
     def results(
         self,
@@ -147,7 +152,7 @@ class Series:
         Raises
         ------
         EquipixError
-            With the first reason why a job has none; the others are worked on before.
+            With the first reason why a job has none. On a cluster the others are worked on before.
         """
         found: dict[str, _Result] = {}
         reasons = []
@@ -182,8 +187,24 @@ class Series:
             np.save(file, array)
         return path
 
+    def refuse_changed(self, made: Iterable[Path]) -> None:
+        """Refuse files that have changed since they were hashed; remove what was made of them.
+
+        Raises
+        ------
+        FileError
+            With the first that has changed.
+        """
+        try:
+            refuse_changed(self._states)
+        except FileError:
+            for each in made:
+                each.unlink(missing_ok=True)
+            raise
+
     def digests(self, files: list[Path]) -> dict[Path, bytes]:
         """SHA-256 of the bytes of each file."""
+        self._states.update({file: state_of(file) for file in files})
         jobs, size = [_Hashed("hash 0", [])], 0
         for file in files:
             with suppress(OSError):  # the worker says what is wrong with it
@@ -202,10 +223,7 @@ class _Hashed(NamedTuple):
 
 
 def _digests(job: _Hashed, _: int | None) -> dict[Path, bytes]:
-    try:
-        return {file: digest(file) for file in job.files}
-    except OSError as error:
-        raise FileError(f"{error.filename}: cannot be read: {error.strerror}") from error
+    return {file: digest(file) for file in job.files}
 
 
 class _Failed(NamedTuple):
@@ -269,10 +287,16 @@ def key_of(hashes: Mapping[Path, str], **known: object) -> str:
 
 
 def work_beside(output: Path) -> Path:
-    """Folder of the pieces of an output."""
-    return output.with_name(f"{output.name}.parts")
+    """Folder of the pieces of an output, on its disk."""
+    place = output.resolve()
+    return place.with_name(f"{place.name}.parts")
 
 
 def remove_work(output: Path) -> None:
-    """Remove the folder of pieces, once the output is written."""
-    shutil.rmtree(work_beside(output), ignore_errors=True)
+    """Remove the pieces, once the output is written, and their folder if it has nothing else."""
+    work = work_beside(output)
+    for each in work.glob("*"):
+        if _OURS.match(each.name):
+            shutil.rmtree(each) if each.is_dir() else each.unlink(missing_ok=True)
+    with suppress(OSError):
+        work.rmdir()

@@ -290,13 +290,12 @@ def raw_frames(files: Sequence[Path]) -> Iterator[Array]:
 
 def sha256_of(files: Iterable[Path], digests: Digests | None = None) -> dict[Path, str]:
     """Hashes of the content of files; `digests` hashes many plain files, such as on a cluster."""
-    given = [*files]
-    if digests is None:
-        with ThreadPoolExecutor() as pool:  # hashlib releases the GIL
-            hashes = pool.map(partial(_sha256, digest_of=digest), given)
-            return dict(zip(given, hashes, strict=True))
-    found = digests([part for file in given for part in _parts(split(file)[0])])
-    return {file: _sha256(file, found.__getitem__) for file in given}
+    parts = {file: _parts(split(file)[0]) for file in files}
+    found = None if digests is None else digests([part for each in parts.values() for part in each])
+    digest_of = digest if found is None else found.__getitem__
+    with ThreadPoolExecutor() as pool:  # hashlib releases the GIL
+        hashes = pool.map(partial(_sha256, digest_of=digest_of), parts, parts.values())
+        return dict(zip(parts, hashes, strict=True))
 
 
 def marks_of_levels(hashes: Mapping[Path, str]) -> dict[Path, str]:
@@ -328,13 +327,13 @@ def with_inputs(metadata: dict[str, Any], hashes: Mapping[Path, str]) -> dict[st
     return {**metadata, "inputs": metadata.get("inputs", {}) | named}
 
 
-def _sha256(path: Path, digest_of: Callable[[Path], bytes]) -> str:
-    """Hash of a file; of an array in one the place counts too, of a folder all files."""
+def _sha256(path: Path, parts: list[Path], digest_of: Callable[[Path], bytes]) -> str:
+    """Hash of a file; of an array in one the place counts too, of a folder all its parts."""
     file, place = split(path)
     if not place and file.is_file():
         return digest_of(file).hex()
     found = hashlib.sha256(place.encode())
-    for part in _parts(file):
+    for part in parts:
         found.update(str(part.relative_to(file)).encode() + digest_of(part))
     return found.hexdigest()
 
@@ -346,8 +345,39 @@ def _parts(file: Path) -> list[Path]:
 
 def digest(file: Path) -> bytes:
     """SHA-256 of the bytes of a file."""
-    with file.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").digest()
+    try:
+        with file.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").digest()
+    except OSError as error:
+        raise FileError(f"{file}: cannot be read: {error.strerror}") from error
+
+
+State = tuple[int, int]
+"""Size of a file, and time of its last change in nanoseconds."""
+
+
+def refuse_changed(states: Mapping[Path, State | None]) -> None:
+    """Refuse a file whose state is no longer that of before.
+
+    Raises
+    ------
+    FileError
+        With the first such file.
+    """
+    for file, state in states.items():
+        if state_of(file) != state:
+            raise FileError(f"{file}: has changed meanwhile: begin again")
+
+
+def state_of(file: Path) -> State | None:
+    """State of a file, of a folder that of all files in it; None where there is none."""
+    try:
+        states = [part.stat() for part in _parts(split(file)[0])]
+        return sum(each.st_size for each in states), max(
+            (each.st_mtime_ns for each in states), default=0
+        )
+    except OSError:
+        return None
 
 
 def origin_of(correction: Path) -> str:

@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from equipix.errors import EquipixError, FileError
 from equipix.experiment.described import excluded_pixels
+from equipix.experiment.image_files import State, state_of
 from equipix.experiment.manifest import Manifest, read_manifest
 from equipix.findings import Finding
 from equipix.io.arrivals import wait_for_change
-from equipix.io.binary import split
 from equipix.io.frames import stream_frames
 from equipix.io.paths import find_files
 from equipix.live.running import Running
@@ -32,8 +31,8 @@ _GIVEN_UP = 5.0
 """Seconds without a change after which a file that cannot be read is reported. It is tried again
 when it changes."""
 
-_State = tuple[int, int]
-"""Size and time of the last change of a file, in nanoseconds."""
+_Format = tuple[tuple[int, ...], np.dtype[Any]]
+"""Rows and columns of frames, and their type."""
 
 _KEYS = ("aperture_before", "flux", "flux_std", "time", "shift_std")
 """Keys of an exposure that a live estimate does not take."""
@@ -61,13 +60,14 @@ class WatchedFolder:
     path: Path
     workers: int | None = None
     _manifest: Manifest | None = None
-    _state: _State | None = None
+    _state: State | None = None
     _running: Running | None = None
     _begun: int = 0
-    _wanted: tuple[tuple[int, ...], np.dtype[Any]] | None = None
-    _taken: dict[Path, _State] = field(default_factory=dict)
-    _shapes: dict[Path, tuple[tuple[int, ...], np.dtype[Any]]] = field(default_factory=dict)
-    _refused: dict[Path, _State] = field(default_factory=dict)
+    _wanted: _Format | None = None
+    _taken: dict[Path, State] = field(default_factory=dict)
+    _shapes: dict[Path, _Format] = field(default_factory=dict)
+    _seen: dict[Path, tuple[State, float]] = field(default_factory=dict)
+    _refused: dict[Path, State] = field(default_factory=dict)
     _reported: set[tuple[Path, str]] = field(default_factory=set)
 
     @property
@@ -111,24 +111,24 @@ class WatchedFolder:
         findings : list of Finding
             Files that are not used, each once for each reason.
         """
-        self._read_manifest()
-        files, waiting, found = self._files(), False, list[Finding]()
+        found = self._read_manifest()
+        files, waiting = self._files(), False
         new, begun = self._forget_changed(files), self._begun
         for file, (position, state) in files.items():
             if state in (self._taken.get(file), self._refused.get(file)):
                 continue
-            age = time.time() - state[1] / 1e9
-            if 0 <= age < _SETTLED:
+            age = self._age(file, state)
+            if age < _SETTLED:
                 waiting = True
                 continue
             try:
-                stacks = _frames_of(file)
-                if _state_of(file) == state:
-                    self._take(file, position, stacks)
+                kind = _format_of(file)
+                if state_of(file) == state:
+                    self._take(file, position, kind)
                     self._taken[file], new = state, True
             except EquipixError as error:
                 # A file that is half written now is whole later.
-                if not 0 <= age < _GIVEN_UP:
+                if age >= _GIVEN_UP:
                     self._refused[file] = state
                     found += self._finding(file, str(error))
         if self._begun > begun:  # the first file was the odd one, and others were refused
@@ -137,11 +137,18 @@ class WatchedFolder:
             return self.look()
         return new, waiting, found
 
-    def _take(
-        self, file: Path, position: tuple[float, float] | None, stacks: list[NDArray[Any]]
-    ) -> None:
+    def _age(self, file: Path, state: State) -> float:
+        """Seconds for which a file has not changed: clocks of two machines differ by some."""
+        by_its_clock = time.time() - state[1] / 1e9
+        if by_its_clock > _GIVEN_UP:
+            return by_its_clock
+        if self._seen.get(file, (None,))[0] != state:
+            self._seen[file] = state, time.monotonic()
+        return time.monotonic() - self._seen[file][1]
+
+    def _take(self, file: Path, position: tuple[float, float] | None, kind: _Format) -> None:
         """Add the frames of a file; refuse them if most files have another format."""
-        self._shapes[file] = kind = stacks[0].shape[1:], stacks[0].dtype
+        self._shapes[file] = kind
         wanted = Counter(self._shapes.values()).most_common(1)[0][0]
         if self._running is not None and self._wanted != wanted:
             self._forget()
@@ -153,8 +160,12 @@ class WatchedFolder:
             )
         if self._running is None:
             self._running, self._wanted = self._begin(kind[0]), wanted
-        for stack in stacks:
-            self._running.add(stack, position)
+        try:
+            for _, frames in stream_frames([file]):
+                self._running.add(frames, position)
+        except EquipixError:
+            self._forget()  # some may have been added
+            raise
 
     def _begin(self, shape: tuple[int, ...]) -> Running:
         assert self._manifest is not None
@@ -171,7 +182,7 @@ class WatchedFolder:
         """Begin anew: sums do not give back what was added."""
         self._running, self._taken, self._refused = None, {}, {}
 
-    def _forget_changed(self, files: dict[Path, tuple[Any, _State]]) -> bool:
+    def _forget_changed(self, files: dict[Path, tuple[Any, State]]) -> bool:
         """Begin anew where a file that was taken has changed or is gone."""
         for file in [each for each in self._shapes if each not in files]:
             del self._shapes[file]
@@ -188,18 +199,28 @@ class WatchedFolder:
         self._reported.add((file, message))
         return [Finding("unused", message, "input")]
 
-    def _read_manifest(self) -> None:
-        """Read the experiment.toml where it is new or has changed, and begin anew."""
-        state = _state_of(self.path)
+    def _read_manifest(self) -> list[Finding]:
+        """Read the experiment.toml where it is new or has changed, and begin anew.
+
+        One that is just being edited is a finding: that of before counts until it can be read.
+        """
+        state = state_of(self.path)
         if self._manifest is not None and state == self._state:
-            return
-        manifest = read_manifest(self.path, Manifest)
-        _refuse_more(self.path, manifest)
+            return []
+        try:
+            manifest = read_manifest(self.path, Manifest)
+            _refuse_more(self.path, manifest)
+        except EquipixError as error:
+            if self._manifest is None:
+                raise
+            self._state = state
+            return self._finding(self.path, str(error))
         if self._manifest is not None:
             self._forget()
         self._manifest, self._state = manifest, state
+        return []
 
-    def _files(self) -> dict[Path, tuple[tuple[float, float] | None, _State]]:
+    def _files(self) -> dict[Path, tuple[tuple[float, float] | None, State]]:
         """Files that are there, with the position of their exposure, or None of dark frames."""
         manifest = self._manifest
         assert manifest is not None
@@ -207,11 +228,11 @@ class WatchedFolder:
         named: list[tuple[str | list[str], tuple[float, float] | None]]
         named = [(each.frames, None) for each in manifest.dark]
         named += [(each.frames, _place(each.shift)) for each in manifest.exposure]
-        found: dict[Path, tuple[tuple[float, float] | None, _State]] = {}
+        found: dict[Path, tuple[tuple[float, float] | None, State]] = {}
         for entry, position in named:
             for name in [entry] if isinstance(entry, str) else entry:
                 for file in _existing(name, self.path.parent):
-                    state = _state_of(file)
+                    state = state_of(file)
                     if state is None:
                         continue
                     if found.get(file, (position,))[0] != position:
@@ -235,20 +256,12 @@ def _existing(name: str, folder: Path) -> list[Path]:
         return []  # not written yet
 
 
-def _state_of(file: Path) -> _State | None:
-    """Size and time of a file; None where there is none."""
-    try:
-        held = Path(split(str(file))[0]).stat()
-    except OSError:
-        return None
-    return held.st_size, held.st_mtime_ns
-
-
-def _frames_of(file: Path) -> list[NDArray[Any]]:
-    """All frames of a file, before any is used: the last may be missing."""
+def _format_of(file: Path) -> _Format:
+    """Shape and type of the frames of a file. All are read before any is used: the last may be missing."""
     if saved_shape(file) is not None:
         raise FileError(f"{file}: holds averaged frames, expected frames of the camera")
-    return [np.array(frames) for _, frames in stream_frames([file])]
+    formats = {(frames.shape[1:], frames.dtype) for _, frames in stream_frames([file])}
+    return formats.pop()
 
 
 def _refuse_more(path: Path, manifest: Manifest) -> None:

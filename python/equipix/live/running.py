@@ -92,7 +92,10 @@ class Estimate(Brief):
         return () if self.calibration is None else self.calibration.findings
 
     def meets(self, accuracy: float) -> bool:
-        """Whether all is determined, the drift is known, and the expected error is small enough.
+        """Whether no parts are left, the drift is known, and the expected error is small enough.
+
+        At least half of the pixels that are not masked are determined then; `determined` says how
+        many.
 
         Parameters
         ----------
@@ -157,8 +160,8 @@ class Running:
 
     Notes
     -----
-    Memory does not grow with the number of frames. Each position has 24 bytes a pixel or less
-    of sums.
+    Memory does not grow with the number of frames. Each position has 20 bytes a pixel of sums, of
+    floating-point numbers 36, and as much again after an estimate.
 
     Examples
     --------
@@ -305,20 +308,19 @@ class Running:
         noise, drift = math.nan, 0.0
         with warnings.catch_warnings(), naming_memory("planning"):
             warnings.simplefilter("ignore", EquipixWarning)
-            if len(positions) > 1:
-                self.estimate()
-            noise, drift = self._noise_and_drift()
+            found = self.estimate().calibration if len(positions) > 1 else None
+            noise, drift = self._noise_and_drift(found)
             used = noise if noise > 0 else _USUAL_NOISE
             causes = {
                 "noise": used,
                 "drift": math.hypot(drift, used / math.prod(self._shape) ** 0.5),
             }
-            found = next_position(self._shape, positions, travel, cfa=self._colours, **causes)
+            best = next_position(self._shape, positions, travel, cfa=self._colours, **causes)
             budget = error_budget(
-                self._shape, np.vstack([positions, found]), noise=used, drift=drift
+                self._shape, np.vstack([positions, best]), noise=used, drift=drift
             )
         rms = math.inf if budget.components > 1 else budget.rms if noise > 0 else math.nan
-        row, col = found.tolist()
+        row, col = best.tolist()
         return Needed((row, col), budget.components, rms)
 
     def _estimated(self) -> Estimate:
@@ -351,8 +353,7 @@ class Running:
             calibration=calibration,
             determined=float(np.mean(usable(calibration.flags))),
         )
-        self._estimate = known
-        noise, drift = self._noise_and_drift()
+        noise, drift = self._noise_and_drift(calibration)
         if not noise > 0:
             return dataclasses.replace(known, rms=math.nan)
         budget = error_budget(self._shape, positions, noise=noise, drift=drift)
@@ -389,13 +390,12 @@ class Running:
         self._averaged, self._reduced = averaged, counts
         return averaged
 
-    def _noise_and_drift(self) -> tuple[float, float]:
+    def _noise_and_drift(self, calibration: Calibration | None) -> tuple[float, float]:
         """Noise of an exposure over its signal, NaN if unknown, and the drift of the lamp.
 
         Each pixel counts with the weight of its exposures: its noise is that of equal exposures
         which determine it as well. Of these the root mean square is taken.
         """
-        calibration = None if self._estimate is None else self._estimate.calibration
         drift = calibration.drift if calibration is not None else None
         if calibration is not None and calibration.weighted is not None:
             measured: Measured = calibration.weighted.exposures

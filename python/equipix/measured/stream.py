@@ -36,7 +36,10 @@ def batches(frames: Array | Iterator[Any]) -> Iterator[Array]:
             group = frames[begin : begin + GROUP]
             yield from (group[start : start + size] for start in range(0, len(group), size))
         return
-    first = _frame(0, next(frames))
+    try:
+        first = _frame(0, next(frames))
+    except StopIteration:
+        return
     empty = np.ma.empty if isinstance(first, np.ma.MaskedArray) else np.empty
     batch = empty((_batch_size(first), *first.shape), first.dtype)
     filled = 0
