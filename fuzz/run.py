@@ -48,7 +48,7 @@ def run(name: str, program: list[str]) -> bool:
     flags = ["-timeout=10", "-rss_limit_mb=2048", "-print_final_stats=1"]
     flags += [f"-max_total_time={SECONDS}", f"-artifact_prefix={artifacts}/{name}-"]
     flags += [f"-runs={INPUTS}"] if INPUTS else []
-    memory = next((each for each in ["/dev/shm"] if os.access(each, os.W_OK)), None)
+    memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
     with tempfile.TemporaryDirectory(prefix="equipix-fuzz-", dir=memory) as folder:
         found, files = Path(folder, "found"), Path(folder, "files")
         found.mkdir()
@@ -65,14 +65,19 @@ def run(name: str, program: list[str]) -> bool:
         )
     told = done.stdout + done.stderr
     read = re.search(r"number_of_executed_units: (\d+)", told)
-    print(f"{name}: {read[1] if read else 'unknown'} files, status {done.returncode}", flush=True)
-    if done.returncode:
+    count = int(read[1]) if read else 0
+    good = not done.returncode and count >= max(INPUTS, 1)
+    print(f"{name}: {count} files, status {done.returncode}", flush=True)
+    if not good:
         print(told[-6000:], flush=True)
-    return not done.returncode
+    return good
 
 
 def main(wanted: list[str]) -> int:
     """Run all targets, or those that are named."""
+    if unknown := set(wanted) - {*COMPILED, *IN_PYTHON}:
+        known = ", ".join([*COMPILED, *IN_PYTHON])
+        sys.exit(f"{sorted(unknown)[0]} is no target, expected one of {known}")
     folder = built()
     targets = {name: [str(folder / name)] for name in COMPILED}
     readers = str(HERE / "readers.py")

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 Content = dict[str, bytes | None]
-"""Bytes of each file by its name in a folder; None of a folder. Hidden files are left out."""
+"""Bytes of each file by its name in a folder; None of a folder. Hidden files are left out, and
+folders of finished pieces, with which the same command goes on."""
 
 
 def content(folder: Path) -> Content:
@@ -34,7 +35,7 @@ def content(folder: Path) -> Content:
     found = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder)
-        if not any(part.startswith(".") for part in name.parts):
+        if not any(part.startswith(".") or part.endswith(".parts") for part in name.parts):
             found[str(name)] = None if path.is_dir() else path.read_bytes()
     return found
 

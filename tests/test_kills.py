@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from importlib import import_module
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +12,6 @@ import pytest
 
 import equipix
 from equipix import cli, nuc, simulate
-from equipix.batch import run as batch_run
 from equipix.batch.evaluation import evaluate
 from equipix.cli.app import COMMANDS, command
 from equipix.io import tiff
@@ -37,6 +37,7 @@ GIVEN = {
     "convert": "IN/response.npz OUT/a.asdf",
     "correct file": "IN/response.npz IN/frames.npy -o OUT/a.fits",
     "correct folder": "IN/response.npz IN/frames.npy IN/level0.npy -o OUT/results",
+    "correct zarr": "IN/response.npz IN/frames.npy -o OUT/a.zarr",
     "correct new folder": "IN/response.npz IN/frames.npy IN/level0.npy -o OUT/new",
     "demo": "--shape 48 64 --frames 2 --keep OUT/experiment -o OUT/a.png",
     "emva": "IN/camera.toml -o OUT/a.html",
@@ -116,15 +117,21 @@ def check(inputs: Path, folder: Path, name: str, count: int) -> None:
         ).write(out / "experiment")
     if second == "folder" or first == "batch":
         (out / "results").mkdir()
-        (out / "results/frames.tif").write_bytes(b"the old one")
+        name_of_old = "lot-levels" if first == "batch" else "frames"
+        (out / f"results/{name_of_old}.tif").write_bytes(b"the old one")
         (out / "results/other").write_bytes(b"of another program")
+    elif second == "zarr":
+        (out / "a.zarr").mkdir()
+        (out / "a.zarr/zarr.json").write_bytes(b"the old one")
     elif second != "new" and first != "simulate":
         (out / given[-1].rpartition("/")[2]).write_bytes(b"the old one")
     forced = [] if first == "batch" or second == "new" else ["--force"]
 
     def work() -> None:
         # In this process, as a worker does it: a cluster would be killed by itself.
-        batch_run.finished = lambda _, tasks, *__: ((each, evaluate(each.job)) for each in tasks)
+        import_module("equipix.batch.evaluation").time = SimpleNamespace(monotonic=lambda: 0.0)
+        module = import_module("equipix.batch.run")
+        module.finished = lambda _, tasks, *__: ((each, evaluate(each.job)) for each in tasks)
         cli.main([*full, *forced])
 
     told = killed(work, out, count, by_file=name in SEVERAL)

@@ -11,6 +11,8 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import asdict
+from importlib import import_module
 from itertools import pairwise
 
 import numpy as np
@@ -19,8 +21,8 @@ import pytest
 import equipix
 from equipix import batch, errors, simulate
 from equipix.batch.cluster import Task, finished
-from equipix.batch.evaluation import Job, Row, described_by, evaluate
-from equipix.io.formats import checked
+from equipix.batch.evaluation import Job, Row, described_by, evaluate, refuse_taken
+from equipix.io.formats import checked, with_checksum
 from equipix.io.tiff import write_frames
 from equipix.report.limits import LimitsFile, limits_template
 from given import written_experiment
@@ -248,6 +250,59 @@ print(json.dumps(asdict(evaluate(job))))
     assert row.status == "failed"
     assert "a.tif: cannot be written" in row.reason
     assert [*results.iterdir()] == []
+
+
+def test_a_sensor_has_no_name_of_the_lot(tmp_path):
+    manifests = [write_levels(tmp_path / "lot"), write_levels(tmp_path / "other")]
+    named = import_module("equipix.batch.run")._named
+    assert [*named(manifests[:1])] == ["lot-levels"]
+    assert [*named(manifests)] == ["lot-levels", "other-levels"]
+
+
+def test_a_name_of_another_sensor_is_refused_while_that_is_there(lot, tmp_path):
+    results, job = tmp_path / "results", Job("a", lot[0], tmp_path / "results", ".tif", {}, None, 0)
+    results.mkdir()
+    row = Row("a", str(lot[1]), status="done")
+    (results / "a.json").write_text(with_checksum(asdict(row)))
+    with pytest.raises(errors.FileError, match=r"a\.json: is that of .*b/experiment"):
+        refuse_taken(job)
+    refuse_taken(job._replace(manifest=lot[1]))
+    lot[1].unlink()
+    refuse_taken(job)
+
+
+def test_no_row_stands_beside_a_result_that_is_not_its_own(lot, tmp_path, monkeypatch):
+    """What ends between the result and its row leaves the result without one."""
+    results = tmp_path / "results"
+    results.mkdir()
+    job = Job("a", lot[0], results, ".tif", {"tolerance": 1e-3}, LimitsFile(), False)
+    assert evaluate(job).status == "done"
+
+    def ended(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("equipix.batch.evaluation.write_page", ended)
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(job._replace(options={"tolerance": 1e-4}))
+    assert not (results / "a.json").exists()
+
+
+def test_an_input_that_changes_meanwhile_is_the_reason(lot, tmp_path, monkeypatch):
+    results = tmp_path / "results"
+    results.mkdir()
+    job = Job("a", lot[0], results, ".tif", {"tolerance": 1e-3}, LimitsFile(), False)
+    dark = next((lot[0].parent / "dark").iterdir())
+    original = equipix.Experiment.run
+
+    def changing(*given, **options):
+        found = original(*given, **options)
+        os.utime(dark, (9, 9))
+        return found
+
+    monkeypatch.setattr("equipix.Experiment.run", changing)
+    row = evaluate(job)
+    assert (row.status, "changed" in row.reason) == ("failed", True)
+    assert not (results / "a.json").exists()
 
 
 def test_what_cannot_be_a_lot_is_refused(lot, tmp_path, monkeypatch):

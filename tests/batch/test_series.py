@@ -16,6 +16,7 @@ import pytest
 import equipix
 from equipix import batch, errors
 from equipix.batch import averages, recordings
+from equipix.batch.series import remove_work
 from equipix.correction.correct_files import correct_files
 from equipix.io.tiff import write_frames
 
@@ -144,6 +145,34 @@ def test_what_is_finished_is_kept(tmp_path, monkeypatch):
     write_frames(tmp_path / "0000.tif", frames, nbytes=frames.nbytes)
     assert not np.array_equal(run().mean, first.mean)
     assert len(calls) == 10
+
+
+def test_an_input_that_changes_meanwhile_is_refused(tmp_path, monkeypatch):
+    names, work = tiffs(tmp_path, frames_of("uint16")), tmp_path / "work"
+    original = averages._sum
+
+    def changing(job, workers):
+        frames = frames_of("uint16", 70)[::-1]
+        write_frames(tmp_path / "0000.tif", frames, nbytes=frames.nbytes)
+        os.utime(tmp_path / "0000.tif", (9, 9))
+        return original(job, workers)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(averages, "_sum", changing)
+        with pytest.raises(errors.FileError, match=r"0000\.tif.* changed"):
+            batch.average(names, work, scheduler=None)
+    assert not list(work.glob("*.sums"))
+    agree(batch.average(names, work, scheduler=None), equipix.average(names))
+
+
+def test_the_folder_of_pieces_keeps_files_of_others(tmp_path):
+    work = tmp_path / "mean.npz.parts"
+    work.mkdir()
+    (work / "notes.txt").write_text("mine")
+    names = tiffs(tmp_path, frames_of("uint16"))
+    batch.average(names, work, scheduler=None)
+    remove_work(tmp_path / "mean.npz")
+    assert [each.name for each in work.iterdir()] == ["notes.txt"]
 
 
 def test_a_saved_average_stays_one(tmp_path):
@@ -307,6 +336,8 @@ def test_what_cannot_be_a_recording_is_refused(tmp_path, correction):
         batch.correct(correction, names, output, scheduler=None, dark=["stored", "stored"])
     with pytest.raises(errors.FileError, match="is one of the inputs"):
         batch.correct(correction, names, names[0], scheduler=None, force=True)
+    with pytest.raises(errors.InputError, match="'workers'"):
+        batch.average(names, tmp_path / "work", scheduler=None, workers=0)
     output.mkdir()
     with pytest.raises(errors.FileError, match="exists already"):
         batch.correct(correction, names, output, scheduler=None)

@@ -133,6 +133,49 @@ def test_a_position_that_is_added_to_the_file_counts(tmp_path: Path) -> None:
     assert counts(found) == (2,) * 6
 
 
+def test_a_manifest_that_is_being_edited_is_told_and_waited_for(tmp_path: Path) -> None:
+    found = watched(tmp_path, count=5)
+    all_frames(tmp_path)
+    found.look()
+    whole = found.path.read_text()
+    found.path.write_text(whole.replace("shift = [0, 0]", "shift = ["))
+    said = found.look()[2]
+    assert [each.kind for each in said] == ["unused"]
+    assert "experiment.toml" in said[0].message
+    assert found.look()[2] == []
+    assert counts(found) == (2,) * 5
+    manifest_of(tmp_path)
+    assert found.look()[2] == []
+    assert counts(found) == (2,) * 6
+
+
+def test_frames_in_a_folder_count_again_when_they_change(tmp_path: Path) -> None:
+    zarr = pytest.importorskip("zarr")
+    path = manifest_of(tmp_path, count=2)
+    path.write_text(path.read_text().replace("p1-*.tif", "p1.zarr"))
+    all_frames(tmp_path, count=1)
+
+    def write(frames: np.ndarray) -> None:
+        array = zarr.create_array(
+            str(tmp_path / "p1.zarr"),
+            shape=frames.shape,
+            dtype=frames.dtype,
+            chunks=(1, *SHAPE),
+            overwrite=True,
+        )
+        array[:] = frames
+        for each in [tmp_path / "p1.zarr", *(tmp_path / "p1.zarr").rglob("*")]:
+            os.utime(each, (time.time() - 10 - len(frames),) * 2)
+
+    write(np.stack(FRAMES[1][:1]))
+    found = WatchedFolder(tmp_path, path)
+    found.look()
+    assert counts(found) == (2, 1)
+    write(np.stack(FRAMES[1][:2]))
+    assert found.look()[0]
+    assert counts(found) == (2, 2)
+
+
 @pytest.mark.parametrize(
     ("more", "words"),
     [("flux = 1.0\n", "'flux'"), ("rotation = 90\n", "'rotation'"), ("time = 1.0\n", "'time'")],

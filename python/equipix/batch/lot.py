@@ -6,7 +6,6 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, cast
 
@@ -235,10 +234,12 @@ def _draw(name: str, values: list[float | None], axes: Any) -> None:
 
 def refuse_no_parquet() -> None:
     """Refuse to begin without the library that writes the table."""
-    if find_spec("pyarrow") is None:
+    try:
+        import pyarrow as pa  # noqa: F401
+    except ImportError as error:
         raise EquipixError(
             "lot.parquet needs pyarrow, which is not installed: pip install 'equipix[batch]'"
-        )
+        ) from error
 
 
 def _write_parquet(path: Path, columns: dict[str, list[Any]]) -> None:

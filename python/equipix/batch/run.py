@@ -80,12 +80,12 @@ def run(
 
     Notes
     -----
-    The name of a sensor is the folder of its manifest. Where two would have one name, all get the
-    name of the file or of folders above too. A worker writes the result, then a page, then
-    ``NAME.json``, each whole or not at all. A sensor whose JSON file has the hash of its inputs, options, limits and version is
-    kept as it is: a lot that was interrupted goes on where it was. Nothing but rows travels through
-    the scheduler. A worker takes a sensor when the memory for it is free, so that large ones go one
-    at a time.
+    The name of a sensor is the folder of its manifest. Where two would have one name, or one would
+    be named ``lot``, all get the name of the file or of folders above too. A worker writes the
+    result, then a page, then ``NAME.json``, each whole or not at all. A sensor whose JSON file has
+    the hash of its inputs, options, limits and version is kept as it is: a lot that was interrupted
+    goes on where it was. Nothing but rows travels through the scheduler. A worker takes a sensor
+    when the memory for it is free.
     """
     if unknown := sorted(set(options) - _OPTIONS):
         known = ", ".join(sorted(_OPTIONS))

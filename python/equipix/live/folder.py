@@ -257,7 +257,7 @@ def _existing(name: str, folder: Path) -> list[Path]:
 
 
 def _format_of(file: Path) -> _Format:
-    """Shape and type of the frames of a file. All are read before any is used: the last may be missing."""
+    """Shape and type of the frames of a file. All are read first: the last may be missing."""
     if saved_shape(file) is not None:
         raise FileError(f"{file}: holds averaged frames, expected frames of the camera")
     formats = {(frames.shape[1:], frames.dtype) for _, frames in stream_frames([file])}

@@ -6,7 +6,6 @@ import base64
 import io
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,6 +19,7 @@ from equipix.comparison import Comparison
 from equipix.errors import EquipixError, InputError
 from equipix.experiment.image_files import sha256_of
 from equipix.findings import Finding, Flag, usable
+from equipix.io import record
 from equipix.io.paths import write_whole
 from equipix.nuc.response import Response
 from equipix.pictures import missing_matplotlib, new_figure
@@ -105,7 +105,7 @@ def page(parts: list[Part], title: str) -> str:
         "page.html",
         title=title,
         version=__version__,
-        made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        made=f"{record.now():.16} UTC".replace("T", " "),
         verdict="FAIL" if "FAIL" in verdicts else "PASS" if verdicts else "",
         parts=parts,
     )
@@ -290,12 +290,16 @@ def _picture(values: Floats, low: float, high: float, cmap: str) -> str:
 def drawn(draw: Callable[[Axes], None]) -> dict[str, str]:
     """Make a drawing that takes the colour of the text around it."""
     figure = new_figure(5.2, 3.8)
+    from matplotlib import rc_context
+
     axes = figure.subplots()
     draw(axes)
     if (legend := axes.get_legend()) is not None:
         legend.set_frame_on(False)  # its white would hide the text in the dark
     buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    # Without a salt each drawing has other names inside.
+    with rc_context({"svg.hashsalt": "equipix"}):
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
     svg = buffer.getvalue()
     svg = svg[svg.index("<svg") :].replace("#000000", "currentColor")
     return {"title": axes.get_title(), "svg": svg}
