@@ -13,11 +13,10 @@ import time
 from pathlib import Path
 
 import numpy as np
+from commands import Row
 
 import equipix
 from equipix import simulate
-
-Row = tuple[str, str, str, str]
 
 SHAPE = (10240, 14648)
 SHIFTS = equipix.cross_pattern(11, 19)

@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import cargo
-
-Row = tuple[str, str, str, str]
+from commands import Row
 
 SMALL = 320 * 240
 """Pixels up to which a sweep runs in cache, and more of them may pass."""

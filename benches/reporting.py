@@ -12,12 +12,11 @@ import time
 from pathlib import Path
 
 import numpy as np
+from commands import Row
 from large import SHAPE, true_sensitivity
 
 import equipix
 from equipix import simulate
-
-Row = tuple[str, str, str, str]
 
 
 def rows(shape: tuple[int, int] = SHAPE) -> list[Row]:

@@ -25,6 +25,7 @@ import reporting
 import response
 import subpixel
 import uncertainty
+from commands import Row
 from peers import table as peers
 
 import batch
@@ -32,8 +33,6 @@ import equipix
 import experiment
 import scene
 from equipix import simulate
-
-Row = tuple[str, str, str, str]
 
 HERE = Path(__file__).parent
 SHIFTS = equipix.cross_pattern(11, 19)

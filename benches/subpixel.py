@@ -5,12 +5,12 @@ from __future__ import annotations
 import time
 
 import numpy as np
+from commands import Row
 
 import equipix
 from equipix import simulate
 
 Array = np.ndarray
-Row = tuple[str, str, str, str]
 
 TOLERANCE = 1e-5
 

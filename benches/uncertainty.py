@@ -5,11 +5,10 @@ from __future__ import annotations
 import time
 
 import numpy as np
+from commands import Row
 
 import equipix
 from equipix import simulate
-
-Row = tuple[str, str, str, str]
 
 NOISE = 1e-3
 MOST_SOLVES = 200

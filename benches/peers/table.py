@@ -21,9 +21,9 @@ from peers.race import Outcome
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from peers.race import ErrorOf
+    from commands import Row
 
-    Row = tuple[str, str, str, str]
+    from peers.race import ErrorOf
 
 SHIFTS = equipix.cross_pattern(11, 19)
 
