@@ -18,7 +18,7 @@ from equipix.findings import Finding
 from equipix.io.arrivals import wait_for_change
 from equipix.io.frames import stream_frames
 from equipix.io.paths import find_files
-from equipix.live.running import Running
+from equipix.live.running import Running, place_of
 from equipix.measured.statistics import saved_shape
 
 _SETTLED = 0.4
@@ -79,7 +79,7 @@ class WatchedFolder:
     def names(self) -> dict[tuple[float, float], str]:
         """Name of each position."""
         exposures = [] if self._manifest is None else self._manifest.exposure
-        return {_place(each.shift): each.name for each in reversed(exposures)}
+        return {place_of(each.shift or (0.0, 0.0)): each.name for each in reversed(exposures)}
 
     def changes(self) -> Iterator[list[Finding]]:
         """Give, whenever frames have arrived and the folder is quiet, which files are not used.
@@ -227,7 +227,7 @@ class WatchedFolder:
         assert manifest.dark is not None
         named: list[tuple[str | list[str], tuple[float, float] | None]]
         named = [(each.frames, None) for each in manifest.dark]
-        named += [(each.frames, _place(each.shift)) for each in manifest.exposure]
+        named += [(each.frames, place_of(each.shift or (0.0, 0.0))) for each in manifest.exposure]
         found: dict[Path, tuple[tuple[float, float] | None, State]] = {}
         for entry, position in named:
             for name in [entry] if isinstance(entry, str) else entry:
@@ -240,11 +240,6 @@ class WatchedFolder:
                     path = file if manifest.layout is None else manifest.layout.behind(file)
                     found[path] = position, state
         return found
-
-
-def _place(shift: list[float] | None) -> tuple[float, float]:
-    row, col = shift or (0.0, 0.0)
-    return row + 0.0, col + 0.0
 
 
 def _existing(name: str, folder: Path) -> list[Path]:

@@ -241,7 +241,7 @@ class Running:
             raise InputError(
                 f"'frame' has dtype {frames.dtype}, expected {self._dtype} like the first"
             )
-        place = None if position is None else _place(position)
+        place = None if position is None else place_of(position)
         with naming_memory("averaging"):
             sums = self._sums.get(place)
             if sums is None:
@@ -413,7 +413,7 @@ class Running:
         return noise if noise > 0 else math.nan, 0.0 if drift is None else drift.size
 
 
-def _place(position: ArrayLike) -> tuple[float, float]:
+def place_of(position: ArrayLike) -> tuple[float, float]:
     """Check one position."""
     row, col = as_shifts(np.reshape(as_array("position", position, ndim=1), (1, -1)))[0].tolist()
     return row + 0.0, col + 0.0  # no negative zeros
