@@ -138,6 +138,8 @@ def _rows(
 ) -> Iterator[Row]:
     """The row of each job, as workers finish them."""
     tasks, done = [], 0
+    if progress is not None:
+        progress(done, len(jobs), "sensors")
     for job in jobs:
         try:
             described = described_by(job.manifest)

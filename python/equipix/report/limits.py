@@ -255,7 +255,7 @@ def limits_template() -> str:
         table, _, name = path.partition(".")
         usual.setdefault(table, {}).update({name: example_of(field)} if name else {})
     title = (
-        "Limits for the option --limits of equipix report, emva and compare: a figure without one "
-        "may be anything."
+        "Limits for the option --limits of equipix report, batch, emva and compare: a figure "
+        "without one may be anything."
     )
     return template(LimitsFile, title, usual)
