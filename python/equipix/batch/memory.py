@@ -9,7 +9,7 @@ from equipix.batch.evaluation import Described
 from equipix.experiment.camera import CameraExperiment
 from equipix.experiment.experiment import Experiment
 from equipix.experiment.image_files import format_of
-from equipix.io.arrays import MOST_AT_ONCE, chunk_frames
+from equipix.io.arrays import chunk_frames
 
 PROCESS = 300_000_000
 """Bytes of a process with all that it imports."""
@@ -35,5 +35,4 @@ def bytes_needed(described: Described, options: Mapping[str, Any]) -> int:
 
 def reading(frame: int, chunk: int) -> int:
     """Bytes that a process needs to read frames of so many bytes, and to copy them."""
-    chunk = chunk if chunk * frame <= MOST_AT_ONCE else 1
     return 2 * max(chunk * frame, 2**27)

@@ -19,7 +19,7 @@ from equipix.batch.cluster import Task, finished, scheduler_at
 from equipix.batch.memory import PROCESS, reading
 from equipix.errors import EquipixError, FileError
 from equipix.experiment.image_files import State, digest, refuse_changed, state_of
-from equipix.io.arrays import MOST_AT_ONCE, chunk_frames
+from equipix.io.arrays import chunk_frames
 from equipix.io.formats import FrameFile
 from equipix.io.frames import stream_part
 from equipix.io.paths import write_whole
@@ -84,8 +84,7 @@ class Frames:
     @cached_property
     def chunk(self) -> int:
         """Frames of a chunk of the only file, where so many are read at once; else 1."""
-        chunk = chunk_frames(self.files[0].path) if len(self.files) == 1 else 1
-        return chunk if chunk * self.frame_bytes <= MOST_AT_ONCE else 1
+        return chunk_frames(self.files[0].path) if len(self.files) == 1 else 1
 
     @property
     def frame_bytes(self) -> int:

@@ -22,7 +22,7 @@ from equipix.io import binary
 _AT_ONCE = 2**26
 """Most bytes that are read at once; at least a frame is."""
 
-MOST_AT_ONCE = 2**29
+_MOST_AT_ONCE = 2**29
 """Most bytes that are read at once where chunks of the file hold as many frames."""
 
 _NPY = b"\x93NUMPY"
@@ -80,7 +80,7 @@ def stream_frames(path: Path, start: int = 0, stop: int | None = None) -> Iterat
 
 
 def chunk_frames(path: Path) -> int:
-    """Number of frames that the chunks of a file hold; 1 of a file without chunks."""
+    """Number of frames in a chunk of a file; 1 without chunks, or where one is too large."""
     if split(path)[0].suffix.lower() not in (*HDF5, *ZARR):
         return 1
     with _opened(path) as array:
@@ -89,16 +89,18 @@ def chunk_frames(path: Path) -> int:
 
 def _chunk_frames(array: Any) -> int:
     chunks = getattr(array, "chunks", None)
-    return int(chunks[-3]) if chunks is not None and len(chunks) > 2 else 1
+    chunk = int(chunks[-3]) if chunks is not None and len(chunks) > 2 else 1
+    return chunk if chunk * _frame_bytes(array) <= _MOST_AT_ONCE else 1
+
+
+def _frame_bytes(array: Any) -> int:
+    return int(math.prod(array.shape[-2:]) * array.dtype.itemsize)
 
 
 def _at_once(array: Any) -> int:
     """Number of frames that are read at once: whole chunks, where there is memory for them."""
-    frame = int(math.prod(array.shape[-2:]) * array.dtype.itemsize)
     chunk = _chunk_frames(array)
-    if chunk * frame > MOST_AT_ONCE:
-        chunk = 1
-    return int(max(chunk, _AT_ONCE // frame // chunk * chunk))
+    return int(max(chunk, _AT_ONCE // _frame_bytes(array) // chunk * chunk))
 
 
 def native(values: Any) -> NDArray[Any]:
