@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from equipix import cross_pattern, errors, metrics, plan, simulate
-from equipix.measured.colour import Colours
+from equipix.measured.colour import Colours, _may_repeat
 
 BAYER = ("RGGB", "GRBG", "GBRG", "BGGR")
 QUAD = "RRGG/RRGG/GGBB/GGBB"
@@ -98,3 +98,20 @@ def test_a_relative_error_takes_the_mean_of_each_colour():
     measured = simulate.filtered(np.ones((6, 6)), "RGGB", response={"R": 3, "G": 2, "B": 1})
     assert np.abs(metrics.relative_error(measured, truth, cfa="RGGB")).max() < 1e-15
     assert np.abs(metrics.relative_error(measured, truth)).max() > 1
+
+
+@pytest.mark.parametrize("period", [(1, 2), (2, 2), (3, 1), (4, 2), (5, 3), (6, 6), (7, 1), (8, 8)])
+def test_a_pattern_that_may_stand_out_is_looked_for(period):
+    rng = np.random.default_rng(period)
+    size = (70, 90)
+    repeats = [-(-length // step) for length, step in zip(size, period, strict=True)]
+    for scatter in (0.001, 0.01, 0.02):
+        once = 0.02 * rng.choice([-1, 1], period)
+        once.flat[0], once.flat[-1] = 0.02, -0.02  # not all alike
+        response = 1 + np.tile(once, repeats)[: size[0], : size[1]]
+        image = response * rng.normal(1, scatter, size)
+        image.flat[rng.choice(image.size, 200)] = np.resize([0, 10, np.nan], 200)
+        # Medians vary as the pixels within the places do, or more.
+        assert _may_repeat(image)
+    flat = rng.normal(1, 0.02, size)
+    assert not _may_repeat(flat)

@@ -30,7 +30,7 @@ from equipix._native import Fit
 from equipix.errors import InputError
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Positions, name_of, nearest_whole
-from equipix.measured.colour import Filters, mean_signal
+from equipix.measured.colour import Filters
 from equipix.measured.defects import BadPixels
 from equipix.measured.measured import Measured
 from equipix.measured.saturation import clipping_advice
@@ -149,8 +149,8 @@ class Exposures(Measured):
         }
         exposures = cls(positions=positions, flux=flux, offset=offset, **found)
         exposures._refuse_nothing(given)
-        shown = mean_signal(exposures.values, exposures.mask)
-        return exposures.behind(Filters.of(measured.colours, *shown))
+        shown = Filters.shown_by(measured.colours, exposures.values, exposures.mask)
+        return exposures.behind(shown)
 
     def _refuse_nothing(self, given: Bools | None) -> None:
         """Refuse exposures that leave no value to use, if the mask `given` is not the reason."""

@@ -159,6 +159,9 @@ _MEASURED = 512
 _FEWEST = 16
 """Least number of pixels in each place of the period."""
 
+_FAINTEST = 0.1
+"""Variance between the clipped means of places, over that of pixels, which a pattern exceeds."""
+
 _LEFT = 2.0
 """Variance that a pattern of a shorter period may leave, over that which the best one leaves."""
 
@@ -218,6 +221,15 @@ class Filters:
         contradicts = rest is not None and rest.spread > _CONTRADICTS
         return cls(found, response, shown=pattern_of(image, corner) if contradicts else None)
 
+    @classmethod
+    def shown_by(
+        cls, colours: Colours | None, values: Array, mask: Bools | None = None
+    ) -> Filters | None:
+        """Filters of a sensor by the mean of its frames (n, rows, cols)."""
+        if colours is None and pattern_of(*mean_signal(values, mask, _SAMPLED)) is None:
+            return None
+        return cls.of(colours, *mean_signal(values, mask))
+
     @property
     def words(self) -> str:
         """Name a pattern that only the values show, or other than the given one; or nothing."""
@@ -263,12 +275,14 @@ def advice(colours: Colours, response: Mapping[str, float] | None = None) -> str
     )
 
 
-def mean_signal(values: Array, mask: Bools | None = None) -> tuple[Floats, tuple[int, int]]:
+def mean_signal(
+    values: Array, mask: Bools | None = None, most: int = _MEASURED
+) -> tuple[Floats, tuple[int, int]]:
     """Mean over the frames (n, rows, cols) that have a usable value, else NaN, and its corner.
 
-    Of the middle of the sensor, in which responses are measured.
+    Of the middle of the sensor, at most so many rows and columns: where responses are measured.
     """
-    (row, col), (rows, cols) = _place(values.shape[1:], _MEASURED)
+    (row, col), (rows, cols) = _place(values.shape[1:], most)
     middle = np.s_[..., row : row + rows, col : col + cols]
     known = np.isfinite(values[middle])
     if mask is not None:
@@ -314,6 +328,8 @@ def pattern_of(image: Array, corner: tuple[int, int] = (0, 0)) -> Colours | None
     smaller pattern flags nothing. Of periods that explain as much the shortest is taken.
     """
     part, corner = _levelled(image, corner)
+    if not _may_repeat(part):
+        return None
     steps = range(1, _LARGEST_PERIOD + 1)
     periods = [*product(steps, steps)][1:]
     places = {period: found for period in periods if (found := _Places.of(part, period))}
@@ -326,6 +342,31 @@ def pattern_of(image: Array, corner: tuple[int, int] = (0, 0)) -> Colours | None
     turned = [at % step for at, step in zip(corner, period, strict=True)]
     colours = places[period].labelled(turned)
     return None if colours.period == (1, 1) else colours
+
+
+def _may_repeat(image: Floats) -> bool:
+    """Whether clipped means vary between the places of a period: no median does where they do not.
+
+    Every period up to 8 divides one of 5 to 8, whose means vary no less. Where the places' medians
+    vary as much as the pixels within them, their clipped means vary by some half of that.
+    """
+    known = np.isfinite(image)
+    values = image[known]
+    if not values.size:
+        return False
+    usual = np.median(values)
+    scatter = np.sqrt(np.median((values - usual) ** 2) / MEDIAN_SQUARE) + _ROUNDING
+    left = np.where(known, np.clip((image - usual) / scatter, -_SIGMAS, _SIGMAS), 0.0)
+    longest = range(_LARGEST_PERIOD // 2 + 1, _LARGEST_PERIOD + 1)
+    of_rows, of_cols = (
+        [np.equal.outer(np.arange(period), np.arange(size) % period) * 1.0 for period in longest]
+        for size in image.shape
+    )
+    for down, right in product(of_rows, of_cols):
+        count = down @ known @ right.T
+        if count.min() < _FEWEST or np.var(down @ left @ right.T / count) > _FAINTEST:
+            return True
+    return False
 
 
 def _levelled(image: Array, corner: tuple[int, int]) -> tuple[Floats, tuple[int, int]]:

@@ -15,7 +15,7 @@ from numpy.typing import DTypeLike
 from equipix._check import EXPOSURES, Array, Bools, Floats, Pixels, Words
 from equipix.errors import InputError
 from equipix.measured import defects
-from equipix.measured.colour import Colours, Filters, mean_rise, mean_signal, pattern_of, planes_of
+from equipix.measured.colour import Colours, Filters, mean_rise, pattern_of, planes_of
 from equipix.measured.noise import NoiseModel, photon_transfer
 from equipix.measured.part import chosen, median, spread
 from equipix.measured.saturation import Clipping, clipping_of, highest, refuse_saturated, unclipped
@@ -215,7 +215,7 @@ class Averaged:
     def filters(self) -> Filters | None:
         """Colour filters of the pixels, where they are given or stand out of the values."""
         if not self._is_counted:
-            return Filters.of(self.colours, *mean_signal(self.values))
+            return Filters.shown_by(self.colours, self.values)
         return Filters.of(self.colours, *mean_rise(self.values))
 
     @property

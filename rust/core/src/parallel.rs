@@ -234,6 +234,15 @@ impl Workers {
         }
     }
 
+    /// Does two works, side by side where a thread is free.
+    pub(crate) fn both<A: Send, B: Send>(
+        &self,
+        one: impl FnOnce() -> A + Send,
+        other: impl FnOnce() -> B + Send,
+    ) -> (A, B) {
+        self.pool.install(|| rayon::join(one, other))
+    }
+
     /// Calls `work` for 0, 1, … `count` − 1 in parallel; the results stand in that order.
     pub fn map<R: Send>(&self, count: usize, work: impl Fn(usize) -> R + Sync + Send) -> Vec<R> {
         self.pool.install(|| (0..count).into_par_iter().map(work).collect())

@@ -47,37 +47,33 @@ impl Matrix {
         matrix
     }
 
+    /// Adds Σ_k Ω_k φ_k φ_k* − Ω φ̄ φ̄*, Ω the sum of all weights and φ̄ the weighted mean. An exposure sees few
+    /// of the block's hats.
     fn add(&mut self, block: &[Spot], seen: &SeenWave) {
         let total: f64 = block.iter().map(|spot| spot.weight).sum();
         let mut nodes: Vec<usize> =
             block.iter().flat_map(|spot| spot.hats.map(|(hat, _)| hat)).collect();
         nodes.sort_unstable();
         nodes.dedup();
-        let (mut heights, mut mean) = (vec![0.0; nodes.len()], vec![[0.0; 2]; nodes.len()]);
-        for spot in block {
-            let factor = seen.factors[spot.exposure];
-            spread(spot, &nodes, &mut heights);
-            for ((height, mean), &node) in heights.iter().zip(&mut mean).zip(&nodes) {
-                let column = factor.map(|part| height * part);
-                let share = spot.weight / total;
-                *mean = [mean[0] + share * column[0], mean[1] + share * column[1]];
-                self.masses[node] += spot.weight * (column[0] * column[0] + column[1] * column[1]);
+        let mut mean = vec![[0.0; 2]; nodes.len()];
+        for Spot { exposure, weight, hats } in block {
+            let [re, im] = seen.factors[*exposure];
+            let size = re * re + im * im;
+            for (i, &(hat, height)) in hats.iter().enumerate() {
+                let share = weight / total * height;
+                let mean = &mut mean[nodes.partition_point(|&node| node < hat)];
+                *mean = [mean[0] + share * re, mean[1] + share * im];
+                self.masses[hat] += weight * size * height * height;
+                for &(other, beside) in &hats[i..] {
+                    let value = weight * (size + seen.penalty) * height * beside;
+                    self.add_element(hat, other, [value, 0.0]);
+                }
             }
         }
-        for spot in block {
-            let factor = seen.factors[spot.exposure];
-            spread(spot, &nodes, &mut heights);
-            let left = |i: usize| {
-                let height: f64 = heights[i];
-                [height * factor[0] - mean[i][0], height * factor[1] - mean[i][1]]
-            };
-            for (i, &first) in nodes.iter().enumerate() {
-                for (j, &second) in nodes.iter().enumerate().skip(i) {
-                    let [re, im] = times(left(i), [left(j)[0], -left(j)[1]]);
-                    let stiff = seen.penalty * heights[i] * heights[j];
-                    let value = [spot.weight * (re + stiff), spot.weight * im];
-                    self.add_element(first, second, value);
-                }
+        for (i, &first) in nodes.iter().enumerate() {
+            for (j, &second) in nodes.iter().enumerate().skip(i) {
+                let [re, im] = times(mean[i], [mean[j][0], -mean[j][1]]);
+                self.add_element(first, second, [-total * re, -total * im]);
             }
         }
     }
@@ -123,13 +119,5 @@ impl Matrix {
             entries.push((2 * hat + 1, 2 * hat + 1, more));
         }
         Cholesky::new(2 * self.near.len(), &entries)
-    }
-}
-
-/// The heights of the nodes' hats where an exposure sees them.
-fn spread(spot: &Spot, nodes: &[usize], heights: &mut [f64]) {
-    heights.fill(0.0);
-    for (hat, height) in spot.hats {
-        heights[nodes.partition_point(|&node| node < hat)] += height;
     }
 }

@@ -37,24 +37,21 @@ pub(super) fn tally<T: Real>(
         control.check()?;
         let mut scratch = vec![0.0; cols];
         let mask = measurements.mask.row(exposure, row, shape);
-        let mut tally = Tally::default();
         let (values, weights) = weigh(measurements, exposure, row, 0..cols, &mut scratch);
+        let (tally, is_plain) = pulp::Arch::new().dispatch(Count { values, weights });
+        if is_plain {
+            return Ok(tally);
+        }
         for (col, (&value, &weight)) in values.iter().zip(weights).enumerate() {
             // A weight of 0 also comes from an infinite variance, which is an error.
             let masked = || mask.is_some_and(|mask| mask[col]);
-            if weight == 0.0 && (masked() || !value.to_f64().is_finite()) {
-                continue;
-            }
-            if !VARIANCES.contains(&(1.0 / weight)) {
+            let is_used = weight != 0.0 || (!masked() && value.to_f64().is_finite());
+            if is_used && !VARIANCES.contains(&(1.0 / weight)) {
                 let each = matches!(measurements.variance, Variance::Measurements(_));
                 let place =
                     if each { format!(" at row {row}, column {col}") } else { String::new() };
                 return Err(bad_variance(exposure, &place, 1.0 / weight));
             }
-            tally.used += 1;
-            tally.positive += usize::from(value.to_f64() > 0.0);
-            tally.weight += weight;
-            tally.largest = tally.largest.max(value.to_f64().abs());
         }
         Ok(tally)
     });
@@ -67,6 +64,41 @@ pub(super) fn tally<T: Real>(
             largest: sum.largest.max(row.largest),
         })
     })
+}
+
+/// Counts measurements, those of a weight above 0; says whether no weight can be an error.
+struct Count<'s, T> {
+    values: &'s [T],
+    weights: &'s [f64],
+}
+
+impl<T: Real> pulp::NullaryFnOnce for Count<'_, T> {
+    type Output = (Tally, bool);
+
+    #[inline(always)]
+    fn call(self) -> (Tally, bool) {
+        const LANES: usize = 8;
+        let [mut used, mut positive, mut weights, mut largest] = [[0.0_f64; LANES]; 4];
+        let mut is_plain = true;
+        let mut add = |i: usize, value: f64, weight: f64| {
+            let (is_used, size) = (weight > 0.0, value.abs());
+            used[i] += f64::from(u8::from(is_used));
+            positive[i] += f64::from(u8::from(is_used && value > 0.0));
+            weights[i] += weight;
+            largest[i] = if is_used && size > largest[i] { size } else { largest[i] };
+            is_plain &= weight > 1.0 / VARIANCES.end && weight < 1.0 / VARIANCES.start;
+        };
+        let (values, last_values) = self.values.as_chunks::<LANES>();
+        let (chunks, last_weights) = self.weights.as_chunks::<LANES>();
+        for (values, weights) in values.iter().zip(chunks) {
+            (0..LANES).for_each(|i| add(i, values[i].to_f64(), weights[i]));
+        }
+        let last = last_values.iter().zip(last_weights);
+        last.for_each(|(value, &weight)| add(0, value.to_f64(), weight));
+        let [used, positive] = [used, positive].map(|counts| counts.iter().sum::<f64>() as usize);
+        let largest = largest.into_iter().fold(0.0, f64::max);
+        (Tally { used, positive, weight: weights.iter().sum(), largest }, is_plain)
+    }
 }
 
 fn bad_variance(exposure: usize, place: &str, variance: f64) -> Error {

@@ -23,7 +23,7 @@
 
 use super::blocks::coarse_spaces;
 use super::operator::Reduced;
-use super::two_level_kernel::{Descend, Direction, Level};
+use super::two_level_kernel::{Close, Descend, Direction};
 use crate::coarse::{Coarse, DAMPING, Hats, Modulated, spacing};
 use crate::control::Control;
 use crate::error::Result;
@@ -107,6 +107,9 @@ impl<'m> TwoLevel<'m> {
             SUMMED * padding.width,
             |band, rows| {
                 let mut sums = CoarseSums::new(hats, padding.width);
+                // M r, of all rows where waves need it.
+                let kept = if self.waves.is_some() { rows.len() } else { padding.width };
+                let mut level = vec![0.0; kept];
                 let mut total = 0.0;
                 for (index, residual) in rows.chunks_exact_mut(padding.width).enumerate() {
                     let row = band * SUMMED + index;
@@ -120,9 +123,13 @@ impl<'m> TwoLevel<'m> {
                         height,
                         above,
                         below,
+                        level: &mut level[index * padding.width % kept..][..padding.width],
                     });
                 }
-                (total, sums.finish(), self.sum_waves(reduced, band, rows))
+                let of_waves = self.waves.as_ref();
+                let of_waves =
+                    of_waves.map(|waves| waves.gather(band * SUMMED, &level, padding.width));
+                (total, sums.finish(), of_waves.unwrap_or_default())
             },
         );
         self.heights.fill(0.0);
@@ -139,54 +146,16 @@ impl<'m> TwoLevel<'m> {
                 }
             }
         }
-        let right = self.heights.clone();
-        match &self.coarse {
-            Some(coarse) => coarse.correct(&mut self.heights, DAMPING),
-            None => self.heights.fill(0.0),
+        let Self { workers, padding, hats, coarse, heights, spread, waves, .. } = self;
+        let of_hats = || solve_hats(hats, coarse.as_ref(), heights, spread, padding.width, workers);
+        let waves =
+            || waves.as_ref().map(|waves| solve_waves(waves, of_waves, padding.width, workers));
+        let (by_hats, found) = workers.both(of_hats, waves);
+        let mut by_waves = 0.0;
+        if let Some(found) = found {
+            (by_waves, self.lines) = found;
         }
-        self.spread();
-        by_diagonal += self.solve_waves(of_waves);
-        by_diagonal + right.iter().zip(&self.heights).map(|(b, y)| b * y).sum::<f64>()
-    }
-
-    /// Ψᵀ r over rows of a band.
-    fn sum_waves<T: Real>(
-        &self,
-        reduced: &Reduced<'_, '_, T>,
-        band: usize,
-        residual: &[f32],
-    ) -> Vec<(usize, Vec<f64>)> {
-        let (Some(waves), padding) = (&self.waves, self.padding) else { return Vec::new() };
-        let mut values = vec![0.0; residual.len()];
-        let rows = values.chunks_exact_mut(padding.width);
-        for (index, (values, residual)) in
-            rows.zip(residual.chunks_exact(padding.width)).enumerate()
-        {
-            let sensitivity = padding.row(&reduced.sensitivity, band * SUMMED + index);
-            pulp::Arch::new().dispatch(Level { residual, sensitivity, values });
-        }
-        waves.gather(band * SUMMED, &values, padding.width)
-    }
-
-    /// Finds the heights of waves from Ψᵀ r; returns the product of the two.
-    fn solve_waves(&mut self, right: Vec<f64>) -> f64 {
-        let Some(waves) = &self.waves else { return 0.0 };
-        let mut heights = right.clone();
-        waves.correct(&mut heights, self.workers);
-        self.lines = waves.open(&heights, self.padding.width, self.workers);
-        right.iter().zip(&heights).map(|(b, y)| b * y).sum()
-    }
-
-    /// The heights of the hats along the rows of the coarse grid.
-    fn spread(&mut self) {
-        let (heights, hats) = (&self.heights, &self.hats);
-        self.workers.map_blocks(&mut self.spread, self.padding.width, |row, line| {
-            let heights = &heights[row * hats.cols.nodes..][..hats.cols.nodes];
-            for (value, &(node, height)) in line.iter_mut().zip(&hats.columns) {
-                let (left, right) = (heights[node as usize], heights[node as usize + 1]);
-                *value = (left + f64::from(height) * (right - left)) as f32;
-            }
-        });
+        by_diagonal + by_waves + by_hats
     }
 
     /// x ← x + a p, then p ← P⁻¹ r + b p for the r of the last [`descend`](Self::descend); returns
@@ -232,8 +201,47 @@ impl<'m> TwoLevel<'m> {
     }
 }
 
+/// Replaces Φᵀ r by the heights of the hats, and finds those along the rows of the coarse grid; returns the
+/// product of the two.
+fn solve_hats(
+    hats: &Hats,
+    coarse: Option<&Coarse>,
+    heights: &mut [f64],
+    spread: &mut [f32],
+    width: usize,
+    workers: &Workers,
+) -> f64 {
+    let right = heights.to_vec();
+    match coarse {
+        Some(coarse) => coarse.correct(heights, DAMPING),
+        None => heights.fill(0.0),
+    }
+    workers.map_blocks(spread, width, |row, line| {
+        let heights = &heights[row * hats.cols.nodes..][..hats.cols.nodes];
+        for (value, &(node, height)) in line.iter_mut().zip(&hats.columns) {
+            let (left, right) = (heights[node as usize], heights[node as usize + 1]);
+            *value = (left + f64::from(height) * (right - left)) as f32;
+        }
+    });
+    right.iter().zip(heights).map(|(b, y)| b * *y).sum()
+}
+
+/// The product of Ψᵀ r and the heights of waves that follow from it, and these along the rows of the coarse
+/// grid.
+fn solve_waves(
+    waves: &Modulated<f32>,
+    right: Vec<f64>,
+    width: usize,
+    workers: &Workers,
+) -> (f64, Vec<f32>) {
+    let mut heights = right.clone();
+    waves.correct(&mut heights, workers);
+    let product = right.iter().zip(&heights).map(|(b, y)| b * y).sum();
+    (product, waves.open(&heights, width, workers))
+}
+
 /// Rows whose sums over hats a thread makes at a time.
-const SUMMED: usize = 32;
+const SUMMED: usize = 64;
 
 /// Φᵀ r over some rows of the sensor.
 struct CoarseSums<'h> {
@@ -270,10 +278,15 @@ impl<'h> CoarseSums<'h> {
         }
         for (below, sums) in self.sums.iter_mut().enumerate() {
             let mut found = vec![0.0; cols];
-            for (sum, &(node, height)) in sums.iter().zip(&self.hats.columns) {
-                let (node, part) = (node as usize, f64::from(height * sum));
-                found[node] += f64::from(*sum) - part;
-                found[node + 1] += part;
+            let mut first = 0;
+            for columns in self.hats.columns.chunk_by(|(a, _), (b, _)| a == b) {
+                let (node, height) = self.hats.cols.at(first as f64);
+                let sums = &sums[first..first + columns.len()];
+                let [all, moment] = pulp::Arch::new().dispatch(Close(sums));
+                let right = height * all + moment / self.hats.cols.spacing;
+                found[node] += all - right;
+                found[node + 1] += right;
+                first += columns.len();
             }
             sums.clear();
             sums.resize(self.width, 0.0);

@@ -13,6 +13,8 @@ pub(super) struct Descend<'l> {
     pub(super) height: f32,
     pub(super) above: &'l mut [f32],
     pub(super) below: &'l mut [f32],
+    /// M r.
+    pub(super) level: &'l mut [f32],
 }
 
 impl pulp::NullaryFnOnce for Descend<'_> {
@@ -23,8 +25,11 @@ impl pulp::NullaryFnOnce for Descend<'_> {
         let mut total = [0.0; LANES];
         let above = self.above.as_chunks_mut::<LANES>().0;
         let below = self.below.as_chunks_mut::<LANES>().0;
-        let rows = self.residual.as_chunks_mut::<LANES>().0.iter_mut().zip(above).zip(below);
-        for (index, ((residual, above), below)) in rows.enumerate() {
+        let level = self.level.as_chunks_mut::<LANES>().0;
+        let rows = self.residual.as_chunks_mut::<LANES>().0.iter_mut().zip(level);
+        for (index, ((residual, level), (above, below))) in
+            rows.zip(above.iter_mut().zip(below)).enumerate()
+        {
             let (q, d) = (chunk(self.product, index), chunk(self.inverse_diagonal, index));
             let m = chunk(self.sensitivity, index);
             for i in 0..LANES {
@@ -32,9 +37,10 @@ impl pulp::NullaryFnOnce for Descend<'_> {
                 let r = if d[i] > 0.0 { residual[i] - self.step * q[i] } else { 0.0 };
                 residual[i] = r;
                 total[i] += r * (r * d[i]);
-                let part = self.height * (m[i] * r);
+                level[i] = m[i] * r;
+                let part = self.height * level[i];
                 below[i] += part;
-                above[i] += m[i] * r - part;
+                above[i] += level[i] - part;
             }
         }
         total.iter().map(|&sum| f64::from(sum)).sum()
@@ -82,19 +88,30 @@ impl pulp::NullaryFnOnce for Direction<'_> {
     }
 }
 
-/// M r.
-pub(super) struct Level<'l> {
-    pub(super) residual: &'l [f32],
-    pub(super) sensitivity: &'l [f32],
-    pub(super) values: &'l mut [f32],
-}
+/// Σ s and Σ i s of sums s along columns i.
+pub(super) struct Close<'l>(pub(super) &'l [f32]);
 
-impl pulp::NullaryFnOnce for Level<'_> {
-    type Output = ();
+impl pulp::NullaryFnOnce for Close<'_> {
+    type Output = [f64; 2];
 
     #[inline(always)]
-    fn call(self) {
-        let products = self.residual.iter().zip(self.sensitivity).map(|(r, m)| r * m);
-        self.values.iter_mut().zip(products).for_each(|(value, product)| *value = product);
+    fn call(self) -> [f64; 2] {
+        const SUMMED: usize = 8;
+        let (chunks, last) = self.0.as_chunks::<SUMMED>();
+        let [mut all, mut moments] = [[0.0; SUMMED]; 2];
+        let mut places = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0];
+        for sums in chunks {
+            for i in 0..SUMMED {
+                let sum = f64::from(sums[i]);
+                all[i] += sum;
+                moments[i] += places[i] * sum;
+                places[i] += SUMMED as f64;
+            }
+        }
+        for (i, &sum) in last.iter().enumerate() {
+            all[i] += f64::from(sum);
+            moments[i] += places[i] * f64::from(sum);
+        }
+        [all, moments].map(|sums| sums.iter().sum())
     }
 }

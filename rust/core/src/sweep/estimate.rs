@@ -1,8 +1,9 @@
 //! One sweep over all exposures: which lines of data meet in which cells and pixels.
 
+use std::marker::PhantomData;
 use std::ops::Range;
 
-use super::kernel::{Difference, Plain, STRETCH, Scratch, improve, measure, quotient};
+use super::kernel::{Advance, Difference, Plain, STRETCH, Scratch, improve, measure, quotient};
 use super::lines::{BeamRow, darkest, pixel_lines, stands_out};
 use crate::control::Control;
 use crate::error::Result;
@@ -27,6 +28,8 @@ const AROUND: usize = 4;
 
 /// Rows and columns whose residuals are sampled.
 const SAMPLED: usize = 64;
+/// Cells that a thread counts at a time.
+const COUNTED: usize = 1 << 16;
 
 /// An estimate of the sensitivity M and the beam L, improved sweep by sweep.
 pub struct Estimate<'m, 'a, T> {
@@ -158,10 +161,7 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
             let mut done = 0;
             for start in (0..rows).step_by(self.rows_in_cache()) {
                 let end = (start + self.rows_in_cache()).min(rows);
-                self.update_beam::<Plain>(done..end + reach, control);
-                if D::IS_LOGARITHMIC {
-                    self.update_beam::<D>(done..end + reach, control);
-                }
+                self.update_beam::<D>(done..end + reach, control);
                 done = end + reach;
                 bands.extend(work(self, start..end));
             }
@@ -245,7 +245,9 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
                 }
             }
         }
-        let cells = self.beams[0].iter().filter(|light| **light != 0.0).count();
+        let blocks: Vec<_> = self.beams[0].chunks(COUNTED).collect();
+        let seen = |index: usize| blocks[index].iter().filter(|light| **light != 0.0).count();
+        let cells: usize = self.workers.map(blocks.len(), seen).into_iter().sum();
         let used = self.exposures.used();
         weak_light::variance(squares, used, used as f64 - (pixels + cells) as f64, freed)
     }
@@ -293,7 +295,11 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
                 let row_of_view = first + band * BAND + index;
                 let seen = BeamRow { exposures, sensitivity, view: 0, row: row_of_view };
                 seen.for_each_stretch(&mut scratch, |lines, cells| {
-                    improve::<T, D>(lines, &mut row[cells]);
+                    let cells = &mut row[cells];
+                    improve::<T, Plain>(lines, cells);
+                    if D::IS_LOGARITHMIC {
+                        improve::<T, D>(lines, cells);
+                    }
                 });
             }
         });
@@ -426,9 +432,8 @@ impl<'m, 'a, T: Real> Estimate<'m, 'a, T> {
         let cols = self.exposures.sensor().cols;
         let padding = Padding::of(self.exposures.geometry());
         self.workers.map_blocks(&mut self.sensitivity, cols, |row, pixels| {
-            for (m, &x) in pixels.iter_mut().zip(padding.row(x, row)) {
-                *m = D::stepped(*m, share * f64::from(x));
-            }
+            let (steps, difference) = (padding.row(x, row), PhantomData::<D>);
+            pulp::Arch::new().dispatch(Advance { sought: pixels, steps, share, difference });
         });
     }
 

@@ -1,6 +1,6 @@
 //! The arithmetic of a sweep: neighbouring values of L or M, side by side in vector registers.
 
-use std::f64::consts::{FRAC_1_SQRT_2, LN_2};
+use std::f64::consts::{FRAC_1_SQRT_2, LN_2, LOG2_E};
 use std::marker::PhantomData;
 
 use crate::exposures::Stretch;
@@ -77,7 +77,8 @@ impl Difference for Logarithmic {
 
     #[inline(always)]
     fn stepped(from: f64, step: f64) -> f64 {
-        if from > 0.0 { from * (step / from).clamp(-LONGEST, LONGEST).exp() } else { from + step }
+        let factor = exponential((step / from).clamp(-LONGEST, LONGEST));
+        if from > 0.0 { from * factor } else { from + step }
     }
 }
 
@@ -92,6 +93,19 @@ fn logarithm(x: f64) -> f64 {
     let s = z * z;
     let series = 1.0 + s * (1.0 / 3.0 + s * (1.0 / 5.0 + s * (1.0 / 7.0 + s * (1.0 / 9.0))));
     f64::from(exponent) * LN_2 + 2.0 * z * series
+}
+
+/// eˣ for abs(x) ≤ [`LONGEST`], to 1e-11: x = n ln 2 + r, eʳ by its series, abs(r) < 0.347.
+#[inline(always)]
+fn exponential(x: f64) -> f64 {
+    // Added to a small number, this leaves its nearest integer in the last bits.
+    const ROUNDER: f64 = 1.5 * (1_u64 << (f64::MANTISSA_DIGITS - 1)) as f64;
+    let shifted = x * LOG2_E + ROUNDER;
+    let r = x - (shifted - ROUNDER) * LN_2;
+    let power = (shifted.to_bits() << (f64::MANTISSA_DIGITS - 1)).wrapping_add(1_f64.to_bits());
+    let last = 1.0 / 720.0 + r * (1.0 / 5040.0 + r * (1.0 / 40320.0 + r * (1.0 / 362_880.0)));
+    let series = 1.0 / 6.0 + r * (1.0 / 24.0 + r * (1.0 / 120.0 + r * last));
+    f64::from_bits(power) * (1.0 + r * (1.0 + r * (0.5 + r * series)))
 }
 
 /// Takes each of `sought` to the minimum of F along it; returns their share of F after that.
@@ -245,6 +259,25 @@ impl<const N: usize> Sums<N> {
     }
 }
 
+/// Takes each of `sought` a `share` of its step further.
+pub(super) struct Advance<'l, D> {
+    pub(super) sought: &'l mut [f64],
+    pub(super) steps: &'l [f32],
+    pub(super) share: f64,
+    pub(super) difference: PhantomData<D>,
+}
+
+impl<D: Difference> pulp::NullaryFnOnce for Advance<'_, D> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        for (sought, &step) in self.sought.iter_mut().zip(self.steps) {
+            *sought = D::stepped(*sought, self.share * f64::from(step));
+        }
+    }
+}
+
 /// slope/weight, or 0 without a measurement.
 #[inline(always)]
 pub(super) fn quotient(slope: f64, weight: f64) -> f64 {
@@ -261,6 +294,15 @@ mod tests {
             let x = 10_f64.powf(f64::from(step) / 1000.0);
             // The first term that the series lacks is 2 z¹¹/11, |z| < 0.172.
             assert!((logarithm(x) - x.ln()).abs() < 1e-9, "{x}");
+        }
+    }
+
+    #[test]
+    fn the_exponential_is_that_of_the_library() {
+        for step in -7000..=7000 {
+            let x = f64::from(step) / 1000.0;
+            // The first term that the series lacks is r¹⁰/10!, abs(r) < 0.347.
+            assert!((exponential(x) / x.exp() - 1.0).abs() < 1e-11, "{x}");
         }
     }
 
