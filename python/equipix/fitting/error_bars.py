@@ -113,17 +113,8 @@ def with_dark_misfit(weighted: Weighted, options: Options) -> Weighted:
     if exposures.dark_variance is None or not found:
         return weighted
     with naming_memory("the misfit of the dark"):
-        answer = fit.uncertainty(
-            error_map=False,
-            functionals=None,
-            shifts=False,
-            offset=False,
-            workers=options.fit.workers,
-            progress=None,
-            dark_variance=exposures.dark_variance,
-            dark_misfit=True,
-        )
-    return weighted._replace(dark_misfit=cast("float", answer.dark_misfit))
+        added = fit.dark_misfit(exposures.dark_variance, workers=options.fit.workers)
+    return weighted._replace(dark_misfit=added)
 
 
 def fits_noise(fit: Fit) -> bool:
