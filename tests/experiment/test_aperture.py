@@ -9,8 +9,8 @@ import pytest
 
 import equipix
 from equipix import simulate
-from equipix.errors import InputError
-from equipix.experiment.aperture import Equalisation, Moves, _radius, region_of_spots
+from equipix.errors import InputError, SpotError
+from equipix.experiment.aperture import Equalisation, Moves, _found, _size, region_of_spots
 from equipix.exposures.exposures import FitOptions
 from equipix.exposures.spots import Spot
 from equipix.findings import Flag
@@ -169,9 +169,55 @@ def test_the_radius_of_a_disc_is_found_to_a_twentieth(shape, radius):
     place = np.array([shape[0] * 0.4, shape[1] * 0.6])
     away = np.indices(shape) - place[:, None, None]
     image = np.where(np.hypot(*away) < radius, 3000.0, 60.0)
-    found = _radius(image, Spot(place, np.zeros(2)))
+    found, half = _size(image, place)
+    assert half == 1530.0
     # By the pixels along its outline, 2πr of πr², each in or out by chance.
     assert abs(found / radius - 1) < 0.05
+
+
+def discs(*places, shape=(1100, 1300), seed=0):
+    """Two frames of discs at places (row, column), each with its radius and signal in DN."""
+    rng = np.random.default_rng(seed)
+    image = np.full(shape, 60.0)
+    for row, col, radius, signal in places:
+        away = np.hypot(*(np.indices(shape).T - (row, col)).T)
+        image += signal * np.clip(radius - away, 0, 1)
+    return rng.poisson(image, (2, *shape)).astype(np.uint16)
+
+
+def found_in(before, after, hot=None):
+    """What is found in images that come one frame at a time, and how often they are read."""
+    reads = []
+
+    def images():
+        reads.append(1)
+        return [iter(np.split(each, 2)) for each in (before, after)]
+
+    return *_found(images, 4095.0, hot), len(reads)
+
+
+def test_a_move_is_found_in_the_part_around_its_spots():
+    before, after = discs((400.3, 700.1, 30, 3000)), discs((410.6, 689.2, 30, 3000), seed=1)
+    before[0, 900:920, 100] = after[:, 3, 7] = 4095  # what the median of 3×3 removes
+    found, shape, radius, reads = found_in(before, after)
+    whole = equipix.measure_shift(before, after, saturation=4095.0)
+    assert (reads, shape) == (1, (1100, 1300))
+    assert abs(radius - 30) < 1.5
+    # The background is that around the spot in both: far less apart than noise moves a centroid.
+    assert np.all(np.abs(found.shift - whole.shift) < 0.1 * whole.std)
+    assert np.all(np.abs(found.before.position - whole.before.position) < 0.1 * whole.std)
+
+
+def test_a_move_with_another_bright_place_is_found_in_whole_images():
+    small = (900, 200, 9, 3000)
+    before, after = discs((400, 700, 30, 3000), small), discs((410, 689, 30, 3000), small)
+    found, *_, reads = found_in(before, after)
+    wanted = equipix.measure_shift(before, after, saturation=4095.0)
+    assert reads == 2
+    assert np.array_equal(found.shift, wanted.shift)
+    large = (900, 200, 28, 3000)
+    with pytest.raises(SpotError, match="'before'"):
+        found_in(discs((400, 700, 30, 3000), large), after)
 
 
 def test_far_moves_take_a_larger_region_and_most_of_a_sensor_is_all_of_it():

@@ -1,7 +1,9 @@
 """Moves of the sensor, measured from images of a small aperture in the beam."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple, Self
 
@@ -237,39 +239,102 @@ def _spots(
     hot: Bools | None,
 ) -> tuple[ShiftMeasurement, tuple[int, int], float]:
     """Find the spots of the move to `exposure`, the shape of the sensor, and a spot's radius."""
-    images = (
-        raw_frames(entry_files(path, entry, manifest.layout))
-        for entry in (exposure.aperture_before, exposure.aperture_after)
-        if entry is not None
-    )
+
+    def images() -> list[Iterator[Array]]:
+        entries = (exposure.aperture_before, exposure.aperture_after)
+        files = (entry_files(path, each, manifest.layout) for each in entries if each is not None)
+        return [raw_frames(each) for each in files]
+
     level = manifest.sensor.saturation_level
     try:
         if equalisation is None:
-            before, after = (np.concatenate(list(raw)) for raw in images)
-            found = measure_shift(before, after, saturation=level, hot=hot)
-            return found, before.shape[1:], _radius(before[0], found.before)
-        before, after = (equalisation.equal(raw, level, hot) for raw in images)
+            return _found(images, level, hot)
+        equal = (equalisation.equal(raw, level, hot) for raw in images())
         # In other units; the first measurement has checked that nothing saturates.
-        found = measure_shift(before, after)
-        first, second = (
-            replace(spot, position=spot.position + equalisation.corner)
-            for spot in (found.before, found.after)
-        )
-        return replace(found, before=first, after=second), equalisation.sensor, 0.0
+        return _moved(measure_shift(*equal), equalisation.corner), equalisation.sensor, 0.0
     except InputError as error:
         raise type(error)(f"{path}: move to exposure '{exposure.name}': {error}") from error
 
 
+def _moved(found: ShiftMeasurement, corner: tuple[int, int]) -> ShiftMeasurement:
+    """What was found in a part of the images that begins at a pixel."""
+    first, second = (
+        replace(spot, position=spot.position + corner) for spot in (found.before, found.after)
+    )
+    return replace(found, before=first, after=second)
+
+
+def _found(
+    images: Callable[[], list[Iterator[Array]]], level: float | None, hot: Bools | None
+) -> tuple[ShiftMeasurement, tuple[int, int], float]:
+    """Find the spots of a move in raw images, the shape of the sensor, and a spot's radius.
+
+    Around the spots, where a coarse look shows that they are the only ones, else in whole images:
+    so these say what is wrong with them.
+    """
+    raw = images()
+    first = [next(frames) for frames in raw]
+    rows, cols = first[0].shape[1:]
+    with suppress(InputError):
+        if (around := _around_spots(first, level, hot)) is not None:
+            region, radius = around
+            parts = [
+                np.concatenate([each[:, *region] for each in chain([start], frames)])
+                for start, frames in zip(first, raw, strict=True)
+            ]
+            known = None if hot is None else hot[region]
+            found = measure_shift(*parts, saturation=level, hot=known)
+            return _moved(found, (region[0].start, region[1].start)), (rows, cols), radius
+    del raw, first
+    before, after = (np.concatenate(list(frames)) for frames in images())
+    found = measure_shift(before, after, saturation=level, hot=hot)
+    return found, (rows, cols), _size(before[0], found.before.position)[0]
+
+
 _COARSE = 512
-"""Rows and columns that show how large a spot is."""
+"""Rows and columns that show where a spot is and how large."""
+
+_FEW = 8
+"""Pairs of bright pixels side by side that are no spot: the search makes each pixel the median of
+3×3, which leaves no line, and the smallest spot has sixteen."""
 
 
-def _radius(image: Array, spot: Spot) -> float:
-    """Radius of a disc of as many pixels as are above half of the spot's level, roughly."""
+def _around_spots(
+    images: Sequence[Array], level: float | None, hot: Bools | None
+) -> tuple[tuple[slice, slice], float] | None:
+    """Part of the images that holds all that is bright, and the radius of the larger spot.
+
+    None where that is most of the sensor, or where it is small.
+    """
+    shape = images[0].shape[1:]
+    step = min(shape) // _COARSE
+    if step < 2:
+        return None
+    known = None if hot is None else hot[::step, ::step]
+    parts = (frames[:, ::step, ::step] for frames in images)
+    coarse = measure_shift(*parts, saturation=level, hot=known)
+    spots = [step * each.position for each in (coarse.before, coarse.after)]
+    sizes = [_size(frames[0], spot) for frames, spot in zip(images, spots, strict=True)]
+    radius = max(radius for radius, _ in sizes)
+    shifts = np.array([[0.0, 0.0], step * coarse.shift])
+    region = region_of_spots(Moves(shifts, shifts, np.array(spots), radius), shape, (1, 1))
+    if region is None:
+        return None
+    for frames, (_, half) in zip(images, sizes, strict=True):
+        bright = frames[0] > frames.dtype.type(half)
+        bright[region] = False
+        if np.count_nonzero(bright[:, 1:] & bright[:, :-1]) >= _FEW:
+            return None
+    return region, radius
+
+
+def _size(image: Array, position: Floats) -> tuple[float, float]:
+    """Radius of a disc of as many pixels as are above half of a spot's level, and that half."""
     step = max(1, min(image.shape) // _COARSE)
     coarse = image[::step, ::step].astype(np.float64)
-    row, col = (spot.position / step).astype(int)
+    row, col = (position / step).astype(int)
     base = np.median(coarse)
     top = np.median(coarse[max(row - 1, 0) : row + 2, max(col - 1, 0) : col + 2])
-    area = np.count_nonzero(coarse > (base + top) / 2) * step**2
-    return float(np.sqrt(area / np.pi))
+    half = float(base + top) / 2
+    area = np.count_nonzero(coarse > half) * step**2
+    return float(np.sqrt(area / np.pi)), half

@@ -113,17 +113,9 @@ def with_dark_misfit(weighted: Weighted, options: Options) -> Weighted:
     if exposures.dark_variance is None or not found:
         return weighted
     with naming_memory("the misfit of the dark"):
-        answer = fit.uncertainty(
-            error_map=False,
-            functionals=None,
-            shifts=False,
-            offset=False,
-            workers=options.fit.workers,
-            progress=None,
-            dark_variance=exposures.dark_variance,
-            dark_misfit=True,
-        )
-    return weighted._replace(dark_misfit=cast("float", answer.dark_misfit))
+        variance = np.ascontiguousarray(exposures.dark_variance)
+        added = fit.dark_misfit(variance, workers=options.fit.workers)
+    return weighted._replace(dark_misfit=added)
 
 
 def fits_noise(fit: Fit) -> bool:
@@ -183,7 +175,7 @@ def of_logarithm(weights: Floats, fit: Fit) -> Floats:
 
 def _relative(dark_variance: Floats | None, scale: float) -> Floats | None:
     """Variance of the dark in units of that of a value of weight 1."""
-    return None if dark_variance is None else dark_variance / scale**2
+    return None if dark_variance is None else np.ascontiguousarray(dark_variance / scale**2)
 
 
 def _std(scale: float, variances: ArrayLike | None) -> Floats:

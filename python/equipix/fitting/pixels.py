@@ -9,7 +9,7 @@ from equipix.fitting.outliers import weights_of
 from equipix.fitting.residuals import FEWEST, in_search
 from equipix.fitting.weighted import Options, Weighted
 from equipix.measured.defects import response_outliers
-from equipix.measured.part import known_part
+from equipix.measured.part import blocks, known_part
 
 _CONTRADICTORY = 9.0
 """Mean squared residual of a pixel over the usual one from which its values contradict the fit. Of
@@ -188,14 +188,22 @@ def std_of_pixels(weighted: Weighted, workers: int | None) -> tuple[Array, Array
     It is 1/√D. The noise of a dark adds at most v Σw/D, which it adds where all exposures show the
     same light.
     """
-    exposures = weighted.exposures
-    information = weighted.fit.information(workers=workers)
-    variance = weighted.noise_variance
+    exposures, variance = weighted.exposures, weighted.exposures.variance
+    information, noise = weighted.fit.information(workers=workers), weighted.noise_variance
+    without = np.empty(exposures.shape)
     with np.errstate(divide="ignore"):
-        without = np.asarray(1 / np.sqrt(information / variance))
+        for rows in blocks(exposures.shape):
+            without[rows] = 1 / np.sqrt(information[rows] / noise)
         if exposures.dark_variance is None:
             return without, without
-        used = (exposures.used(weighted.fit, k) for k in range(len(exposures)))
-        weights = sum(weights_of(exposures.variance, k, each) for k, each in enumerate(used))
-        total = variance + exposures.dark_variance * weights
-        return without, np.asarray(1 / np.sqrt(information / total))
+        found = np.zeros(exposures.shape)  # Σw, then the deviation
+        for k in range(len(exposures)):
+            used = exposures.used(weighted.fit, k)
+            for rows in blocks(exposures.shape):
+                is_map = variance is not None and variance.ndim == 3
+                part = variance[:, rows] if is_map and variance is not None else variance
+                found[rows] += weights_of(part, k, used[rows])
+        for rows in blocks(exposures.shape):
+            total = noise + exposures.dark_variance[rows] * found[rows]
+            found[rows] = 1 / np.sqrt(information[rows] / total)
+    return without, found

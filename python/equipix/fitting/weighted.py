@@ -18,6 +18,7 @@ from equipix.errors import InputError
 from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.fitting.outliers import rejected, without_fallen_dust
 from equipix.measured.noise import modelled_variances
+from equipix.measured.part import blocks
 
 _FEWEST_FOR_REJECTION = 3
 """Fewest exposures: with two, no residual shows which of two measurements is wrong."""
@@ -222,8 +223,12 @@ def expected(
 ) -> Iterator[Array]:
     """Signals c · L · M; c times the medians `middle` where the fit determines none."""
     for k, flux in enumerate(exposures.flux.values):
-        signal = exposures.light(fit, k, workers) * fit.sensitivity
-        yield np.where(np.isfinite(signal), signal, flux * middle)
+        signal = exposures.light(fit, k, workers)
+        for rows in blocks(signal.shape):
+            signal[rows] *= fit.sensitivity[rows]
+            known = np.isfinite(signal[rows])
+            np.multiply(flux, middle[rows], out=signal[rows], where=~known)
+        yield signal
 
 
 _SAMPLE = 4096

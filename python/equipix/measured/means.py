@@ -311,7 +311,8 @@ class Averaged:
         Of a dark that is not kept it is what the averages state; None without any.
         """
         if self.darks:
-            return self._dark_variances(noise)[0]
+            common, _ = self._dark_variances(noise)
+            return np.broadcast_to(np.asarray(common), self.saturated.shape)
         stated = float(np.mean(self._of_dark))
         return np.full(self.saturated.shape, stated) if stated > 0 else None
 
@@ -320,7 +321,7 @@ class Averaged:
 
         Darks Σ s D of two exposures have the covariance Σ s s' var(D). Its mean over all pairs
         counts as that of all: where exposures have equal weights, the error of M and F are those of
-        the darks.
+        the darks. A variance that all pixels have is one number.
         """
         if not self.darks:
             return None, [0.0] * len(self.frames)
@@ -418,12 +419,13 @@ def _variance_of_dark(dark: FrameStatistics, noise: NoiseModel) -> Floats:
     """Variance of the mean of dark frames, from the noise of one frame.
 
     One frame shows no noise, and what exposures in bright light say of that of the dark may be far
-    off: its scatter between neighbours, which holds its pattern too, stands for it.
+    off: its scatter between neighbours, which holds its pattern too, stands for it. Of pixels that
+    all have as many frames it is one number.
     """
-    is_one = dark.count.max() <= 1
-    of_frame = _between_neighbours(dark.mean) if is_one else noise.scatter(0.0)
-    scatter = of_frame / np.maximum(dark.count, 1)
-    of_mean = noise.of_mean(int(dark.count.max()))
+    least, most = int(dark.count.min()), int(dark.count.max())
+    of_frame = _between_neighbours(dark.mean) if most <= 1 else noise.scatter(0.0)
+    scatter = of_frame / np.maximum(most if least == most else dark.count, 1)
+    of_mean = noise.of_mean(most)
     return np.asarray(scatter + of_mean.rounding_apart(0.0, dark.mean, raw=True))
 
 

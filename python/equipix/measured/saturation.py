@@ -7,6 +7,7 @@ import numpy as np
 
 from equipix._check import Array, Bools, Words, as_level
 from equipix.errors import InputError
+from equipix.measured.part import blocks
 from equipix.measured.statistics import FrameStatistics
 
 _MANY = 16
@@ -123,6 +124,8 @@ def clipping_of(frames: FrameStatistics) -> Clipping | None:
     missing from few other pixels, those at the level need not be compared with those just below,
     which contain the pixels that saturate in some frames only.
     """
+    if _few_near_highest(frames):
+        return None  # usually: then no map is made
     raw = _raw_mean(frames)
     known = raw[frames.saturated == 0] if frames.saturated.any() else raw
     found = clipping(known, crowded=0.0)
@@ -134,6 +137,19 @@ def clipping_of(frames: FrameStatistics) -> Clipping | None:
     if np.count_nonzero(steady & ~others) >= _MANY and np.mean(steady[others]) < _RARE:
         return found
     return clipping(raw, step=frames.step) or plateau(raw)
+
+
+def _few_near_highest(frames: FrameStatistics) -> bool:
+    """Whether too few values are as high as the highest, or on a plateau with it, for a level."""
+
+    def values(rows: slice) -> Array:
+        raw = _raw_mean(frames, rows)
+        return np.where((frames.saturated[rows] == 0) & np.isfinite(raw), raw, -np.inf)
+
+    highest = {rows.start: values(rows).max() for rows in blocks(frames.mean.shape)}
+    level = np.rint(max(highest.values())) - _SPREAD + 1
+    near = (rows for rows in blocks(frames.mean.shape) if highest[rows.start] >= level)
+    return bool(sum(np.count_nonzero(values(rows) >= level) for rows in near) < _MANY)
 
 
 def unclipped(frames: FrameStatistics, clipped: Clipping) -> Bools:
@@ -150,9 +166,10 @@ def unclipped(frames: FrameStatistics, clipped: Clipping) -> Bools:
     return below
 
 
-def _raw_mean(frames: FrameStatistics) -> Array:
-    """Mean before the dark was subtracted."""
-    return frames.mean if frames.dark is None else frames.mean + frames.dark.mean
+def _raw_mean(frames: FrameStatistics, rows: slice = slice(None)) -> Array:
+    """Mean before the dark was subtracted, of some rows."""
+    mean: Array = frames.mean[rows]
+    return mean if frames.dark is None else mean + frames.dark.mean[rows]
 
 
 def clipping_advice(

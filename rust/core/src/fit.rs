@@ -230,13 +230,39 @@ impl Solution<'_> {
         control: &Control,
     ) -> Result<Vec<f64>> {
         self.check(exposures)?;
-        let (sensor, rotations) = (exposures.sensor(), &exposures.positions().rotations);
-        let light = |k: usize| {
-            let mut light = self.beam.light(self.shifts[k], rotations[k], sensor, workers);
-            let lost = self.lost.get(k).copied().unwrap_or_default();
-            lost.iter().for_each(|&pixel| light[pixel] = f64::NAN);
-            light
-        };
+        let light = |k| self.light(exposures, k, workers);
         information::of_sensor(exposures, self.flux, light, workers, control)
+    }
+
+    /// What errors of such variances that all exposures share, as those of a dark, leave in F once M has followed them: an
+    /// upper limit of what they add to it, since the beam follows too.
+    ///
+    /// # Errors
+    /// As [`information`](Self::information).
+    pub(crate) fn left_of_common<T: Real>(
+        &self,
+        exposures: &Exposures<'_, T>,
+        variance: &[f64],
+        workers: &Workers,
+        control: &Control,
+    ) -> Result<f64> {
+        self.check(exposures)?;
+        let given = [self.flux, self.prior.as_deref().unwrap_or_default(), variance];
+        let light = |k| self.light(exposures, k, workers);
+        information::left_of_common(exposures, given, light, workers, control)
+    }
+
+    /// The light of an exposure, NaN where it or the measurement was lost.
+    fn light<T: Real>(
+        &self,
+        exposures: &Exposures<'_, T>,
+        k: usize,
+        workers: &Workers,
+    ) -> Vec<f64> {
+        let (sensor, rotations) = (exposures.sensor(), &exposures.positions().rotations);
+        let mut light = self.beam.light(self.shifts[k], rotations[k], sensor, workers);
+        let lost = self.lost.get(k).copied().unwrap_or_default();
+        lost.iter().for_each(|&pixel| light[pixel] = f64::NAN);
+        light
     }
 }

@@ -31,6 +31,45 @@ pub(crate) fn of_sensor<T: Real>(
     Ok(information)
 }
 
+/// Σ w − (Σ w c L)²/(D + λ) of all pixels, with λ of `prior`, times `variance`, summed: what is left in F of errors of
+/// such variances that all exposures share, once M has followed them.
+///
+/// # Errors
+/// As [`of_sensor`].
+pub(crate) fn left_of_common<T: Real>(
+    exposures: &Exposures<'_, T>,
+    [flux, prior, variance]: [&[f64]; 3],
+    light: impl Fn(usize) -> Vec<f64>,
+    workers: &Workers,
+    control: &Control,
+) -> Result<f64> {
+    let (sensor, cols) = (exposures.sensor(), exposures.sensor().cols);
+    let mut moments = workers.filled(sensor.len(), [0.0; 3], control);
+    for (k, &flux) in flux.iter().enumerate() {
+        control.check()?;
+        let light = light(k);
+        workers.map_blocks(&mut moments, cols, |row, moments| {
+            each(exposures, k, [row, 0], flux, &light[row * cols..][..cols], |i, weight, light| {
+                let [all, along, square] = &mut moments[i];
+                *all += weight;
+                *along += weight * light;
+                *square += weight * light * light;
+            });
+        });
+    }
+    let of_rows = workers.map_blocks(&mut moments, cols, |row, moments| {
+        let first = row * cols;
+        let of_pixel = |(i, [all, along, square]): (usize, &[f64; 3])| {
+            let prior = prior.get(first + i).copied().unwrap_or_default();
+            let left = if *square > 0.0 { all - along * along / (square + prior) } else { 0.0 };
+            variance[first + i] * left
+        };
+        moments.iter().enumerate().map(of_pixel).sum::<f64>()
+    });
+    control.check()?;
+    Ok(of_rows.into_iter().sum())
+}
+
 /// D of one pixel, likewise, with the fluxes as given.
 pub(crate) fn of_pixel<T: Real>(
     exposures: &Exposures<'_, T>,
@@ -48,21 +87,34 @@ pub(crate) fn of_pixel<T: Real>(
 pub(crate) fn add<T: Real>(
     exposures: &Exposures<'_, T>,
     k: usize,
-    [row, col]: [usize; 2],
+    pixel: [usize; 2],
     flux: f64,
     light: &[f64],
     sums: &mut [f64],
+) {
+    each(exposures, k, pixel, flux, light, |i, weight, light| sums[i] += weight * light * light);
+}
+
+/// Calls `take` with the place along the light, w and c L of the measurements of exposure `k` from a pixel on along
+/// its row.
+fn each<T: Real>(
+    exposures: &Exposures<'_, T>,
+    k: usize,
+    [row, col]: [usize; 2],
+    flux: f64,
+    light: &[f64],
+    mut take: impl FnMut(usize, f64, f64),
 ) {
     let mut scratch = vec![0.0; light.len()];
     let weight = match exposures.stretch(k, row, col..col + light.len(), &mut scratch) {
         Stretch::Uniform(_, weight) => Some(weight),
         Stretch::Weighted(..) => None,
     };
-    for (i, (sum, light)) in sums.iter_mut().zip(light).enumerate() {
+    for (i, light) in light.iter().enumerate() {
         let (weight, light) = (weight.unwrap_or(scratch[i]), flux * light);
         // Light that is not known has no number, and a measurement that is not used no weight.
         if weight > 0.0 && light.is_finite() {
-            *sum += weight * light * light;
+            take(i, weight, light);
         }
     }
 }

@@ -229,4 +229,4 @@ pub use geometry::Rotation;
 pub use joint::SMOOTHING;
 pub use parallel::Workers;
 pub use solve::{Method, Options, calibrate};
-pub use uncertainty::{ErrorMap, Uncertainty};
+pub use uncertainty::{ErrorMap, Uncertainty, misfit_by_dark};

@@ -13,5 +13,5 @@ mod reduced;
 mod sampling;
 mod smoothed;
 
-pub use ask::Uncertainty;
+pub use ask::{Uncertainty, misfit_by_dark};
 pub use sampling::ErrorMap;

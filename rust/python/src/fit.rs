@@ -14,7 +14,7 @@ use std::sync::Arc;
 
 use equipix_core::{
     Beam, Control, Ended, Exposures, Fit, History, Look, Real, Refinement, Result, Shape, Solution,
-    Uncertainty, Workers,
+    Uncertainty, Workers, misfit_by_dark,
 };
 use numpy::{
     PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3,
@@ -183,9 +183,31 @@ impl PyFit {
         image(py, found, checked.sensor())
     }
 
+    /// What the noise of a dark that was subtracted from all exposures adds to F on average.
+    #[pyo3(signature = (dark_variance, *, workers))]
+    fn dark_misfit(
+        &self,
+        py: Python<'_>,
+        dark_variance: PyReadonlyArray2<'_, f64>,
+        workers: Option<NonZeroUsize>,
+    ) -> PyResult<f64> {
+        let (arrays, borrowed) = (self.data.arrays.borrow(py)?, self.borrow(py));
+        let (measurements, solution) = (arrays.view()?, borrowed.solution()?);
+        let (checked, variance) = (&self.data.checked, dark_variance.as_slice()?);
+        run::interruptible(py, None, |control| {
+            let workers = Workers::new(workers)?;
+            either!(measurements, m => {
+                let exposures = Exposures::again(m, checked)?;
+                workers.enter(|| {
+                    misfit_by_dark(&exposures, &solution, variance, &workers, control)
+                })
+            })
+        })
+    }
+
     /// Answers what is asked of it, from one linear problem.
     #[pyo3(signature = (*, error_map, functionals, shifts, offset, workers, progress,
-                        dark_variance=None, dark_misfit=false))]
+                        dark_variance=None))]
     #[expect(clippy::too_many_arguments, reason = "the questions that there are")]
     fn uncertainty(
         &self,
@@ -197,11 +219,10 @@ impl PyFit {
         workers: Option<NonZeroUsize>,
         progress: Option<Bound<'_, PyAny>>,
         dark_variance: Option<PyReadonlyArray2<'_, f64>>,
-        dark_misfit: bool,
     ) -> PyResult<PyUncertainty> {
         let functionals = functionals.as_ref().map(|stack| stack.as_slice()).transpose()?;
         let dark = dark_variance.as_ref().map(|image| image.as_slice()).transpose()?;
-        let questions = Questions { error_map, functionals, shifts, offset, dark, dark_misfit };
+        let questions = Questions { error_map, functionals, shifts, offset, dark };
         let (arrays, borrowed) = (self.data.arrays.borrow(py)?, self.borrow(py));
         let (measurements, solution) = (arrays.view()?, borrowed.solution()?);
         let checked = &self.data.checked;
@@ -313,7 +334,6 @@ pub(crate) struct PyUncertainty {
     variances: Option<Py<PyArray1<f64>>>,
     shift_variances: Option<Vec<[f64; 2]>>,
     offset_variances: Option<(f64, f64)>,
-    dark_misfit: Option<f64>,
     incomplete: u64,
 }
 
@@ -328,7 +348,6 @@ impl PyUncertainty {
             variances: answers.variances.map(|values| read_only(py, values)).transpose()?,
             shift_variances: answers.shifts,
             offset_variances: answers.offset.map(Into::into),
-            dark_misfit: answers.dark_misfit,
             incomplete: answers.incomplete,
         })
     }
@@ -343,7 +362,6 @@ struct Questions<'a> {
     offset: bool,
     /// The variance by pixel of a dark that was subtracted from all exposures.
     dark: Option<&'a [f64]>,
-    dark_misfit: bool,
 }
 
 struct Answers {
@@ -351,7 +369,6 @@ struct Answers {
     variances: Option<Vec<f64>>,
     shifts: Option<Vec<[f64; 2]>>,
     offset: Option<[f64; 2]>,
-    dark_misfit: Option<f64>,
     incomplete: u64,
 }
 
@@ -372,7 +389,6 @@ impl Questions<'_> {
             variances: self.functionals.map(|stack| bars.variances(stack)).transpose()?,
             shifts: if self.shifts { bars.shift_variances()? } else { None },
             offset: if self.offset { bars.offset_variances()? } else { None },
-            dark_misfit: self.dark_misfit.then(|| bars.misfit_by_dark()).transpose()?,
             incomplete: 0,
         };
         Ok(Answers { incomplete: bars.incomplete(), ..answers })

@@ -211,7 +211,10 @@ pub(crate) fn misfit_by_dark(
     answer: &Answer,
     workers: usize,
 ) -> Result<f64> {
-    ask(experiment, answer, workers, |bars| bars.misfit_by_dark())
+    let Some(dark) = relative_dark(experiment, answer) else { return Ok(0.0) };
+    with_solution(experiment, answer, workers, |exposures, solution, workers, control| {
+        equipix_core::misfit_by_dark(exposures, solution, &dark, workers, control)
+    })
 }
 
 /// The variance of a measurement of weight 1: 1 where variances are given, else reduced χ².
@@ -277,6 +280,29 @@ fn ask<R>(
     workers: usize,
     question: impl FnOnce(&mut Uncertainty<'_, '_, f64>) -> Result<R>,
 ) -> Result<R> {
+    with_solution(experiment, answer, workers, |exposures, solution, workers, control| {
+        let bars = Uncertainty::new(exposures, solution, workers, control)?;
+        match relative_dark(experiment, answer) {
+            None => question(&mut { bars }),
+            Some(dark) => question(&mut bars.with_dark(&dark)?),
+        }
+    })
+}
+
+/// The variance of the dark in units of that of a measurement of weight 1, if there is one.
+fn relative_dark(experiment: &Experiment, answer: &Answer) -> Option<Vec<f64>> {
+    let unit = variance_of_weight_1(experiment, answer);
+    let relative = || experiment.dark.iter().map(|variance| variance / unit).collect();
+    (!experiment.dark.is_empty()).then(relative)
+}
+
+/// Does something with the exposures of an experiment and the solution that an answer is.
+fn with_solution<R>(
+    experiment: &Experiment,
+    answer: &Answer,
+    workers: usize,
+    work: impl FnOnce(&Exposures<'_, f64>, &Solution<'_>, &Workers, &Control) -> Result<R>,
+) -> Result<R> {
     let (workers, control) = (pool(workers)?, Control::new());
     let [rows, cols] = answer.beam_shape;
     let solution = Solution {
@@ -297,15 +323,7 @@ fn ask<R>(
         prior: (!answer.prior.is_empty()).then(|| answer.prior.clone().into()),
         lost: answer.lost.iter().map(Vec::as_slice).collect(),
     };
-    with_exposures(experiment, &workers, |exposures| {
-        let bars = Uncertainty::new(exposures, &solution, &workers, &control)?;
-        if experiment.dark.is_empty() {
-            return question(&mut { bars });
-        }
-        let unit = variance_of_weight_1(experiment, answer);
-        let relative: Vec<f64> = experiment.dark.iter().map(|variance| variance / unit).collect();
-        question(&mut bars.with_dark(&relative)?)
-    })
+    with_exposures(experiment, &workers, |exposures| work(exposures, &solution, &workers, &control))
 }
 
 fn answer(fit: Fit) -> Answer {

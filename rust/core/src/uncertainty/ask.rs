@@ -2,7 +2,7 @@
 
 use super::joint::JointCovariance;
 use super::reduced::ReducedCovariance;
-use super::sampling::ErrorMap;
+use super::sampling::{ErrorMap, NEGLIGIBLE};
 use crate::control::Control;
 use crate::error::{Error, Result};
 use crate::exposures::Exposures;
@@ -64,17 +64,6 @@ impl<'m, 'a, T: Real> Uncertainty<'m, 'a, T> {
         Ok(self)
     }
 
-    /// What the noise of the dark adds on average to F, the sum of squared residuals; 0 without a dark.
-    ///
-    /// # Errors
-    /// As [`new`](Self::new).
-    pub fn misfit_by_dark(&mut self) -> Result<f64> {
-        match &mut self.problem {
-            Problem::Reduced(problem) => problem.misfit_by_dark(self.control),
-            Problem::Joint(problem) => problem.misfit_by_dark(self.control),
-        }
-    }
-
     /// How many searches of the answers so far ended before they were as exact as they should be: the
     /// measurements barely constrain some pattern, and variances that it is part of are too small.
     #[must_use]
@@ -131,6 +120,36 @@ impl<'m, 'a, T: Real> Uncertainty<'m, 'a, T> {
             Problem::Reduced(_) => Ok(None),
             Problem::Joint(problem) => problem.offset_variances(self.control),
         }
+    }
+}
+
+/// What the noise of a dark that was subtracted from all exposures, of these variances by pixel, adds on average to F,
+/// the sum of squared residuals of the solution; nothing where offsets were sought. The weights must be those without it.
+///
+/// The linear problem, which takes as much memory as the fit, is set up only where this is not negligible.
+///
+/// # Errors
+/// As [`Uncertainty::new`] and [`Uncertainty::with_dark`].
+pub fn misfit_by_dark<'m, T: Real>(
+    exposures: &'m Exposures<'_, T>,
+    solution: &Solution<'m>,
+    variance: &[f64],
+    workers: &'m Workers,
+    control: &'m Control,
+) -> Result<f64> {
+    check_dark(variance, exposures.sensor().len())?;
+    if exposures.offset() {
+        return Ok(0.0);
+    }
+    let left = solution.left_of_common(exposures, variance, workers, control)?;
+    let pixels = solution.sensitivity.iter().filter(|m| m.is_finite()).count();
+    if left <= NEGLIGIBLE * pixels as f64 {
+        return Ok(left);
+    }
+    let bars = Uncertainty::new(exposures, solution, workers, control)?.with_dark(variance)?;
+    match bars.problem {
+        Problem::Reduced(mut problem) => problem.misfit_by_dark(control),
+        Problem::Joint(mut problem) => problem.misfit_by_dark(control),
     }
 }
 

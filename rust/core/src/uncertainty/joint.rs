@@ -30,7 +30,7 @@ use super::joint_dark::Dark;
 use super::joint_gauge::{Hidden, Tilts, count, form, valid};
 use super::joint_pulls::{add_change, product, pull_of};
 use super::sampling::{ErrorMap, LACK_OF_DRAW, LACK_OF_FUNCTIONAL, LACK_WITH_DARK};
-use super::sampling::{NEGLIGIBLE, NOTHING, Sampled, mean_misfit};
+use super::sampling::{NOTHING, Sampled, mean_misfit};
 use super::smoothed::{is_smoothed, smoothed};
 use crate::control::Control;
 use crate::convergence::FEWEST_ITERATIONS;
@@ -152,12 +152,8 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
     /// What the noise of the dark adds to F, on average; 0 without a dark.
     pub(super) fn misfit_by_dark(&mut self, control: &Control) -> Result<f64> {
         let Some(left) = self.dark.as_ref().map(|dark| dark.left) else { return Ok(0.0) };
-        let pixels = count(&self.valid);
-        if left <= NEGLIGIBLE * pixels {
-            return Ok(left);
-        }
         self.known = Known::default();
-        let propagated = mean_misfit(pixels, |draw| {
+        let propagated = mean_misfit(count(&self.valid), |draw| {
             let slope = self.pulls_of_noise(draw, false, control)?;
             self.apply_inverse(slope, LACK_OF_FUNCTIONAL, control)?;
             Ok(self.energy)

@@ -23,7 +23,7 @@
 use std::sync::Arc;
 
 use super::sampling::{Drawn, ErrorMap, LACK_OF_DRAW, LACK_OF_FUNCTIONAL, LACK_WITH_DARK};
-use super::sampling::{NEGLIGIBLE, NOTHING, Sampled, mean_misfit};
+use super::sampling::{NOTHING, Sampled, mean_misfit};
 use crate::connectivity::NONE;
 use crate::control::Control;
 use crate::convergence::FEWEST_ITERATIONS;
@@ -154,11 +154,8 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
         }
         self.smallest = Smallest::default();
         mean_misfit(self.count, |draw| {
-            let Self { search, count, .. } = self;
+            let search = &mut self.search;
             let left = search.reduced.draw(Draw::Dark(draw), &mut search.residual, control)?;
-            if left <= NEGLIGIBLE * *count {
-                return Ok(left);
-            }
             self.apply_inverse(LACK_OF_FUNCTIONAL, control)?;
             Ok(left - self.search.energy)
         })
