@@ -191,7 +191,7 @@ impl Components {
 
 impl Components {
     /// Gives loosely tied pixels that belong to no component, and cells that they alone see, the label of the
-    /// largest one in their piece, `pieces` being those of all pixels however they are tied.
+    /// largest one in their piece, `pieces` being those of pixels however they are tied.
     ///
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled) if `control` asks to stop.
@@ -206,7 +206,8 @@ impl Components {
         let mut largest = vec![NONE; count];
         for (&piece, &label) in pieces.iter().zip(&self.pixels).filter(|(_, label)| **label != NONE)
         {
-            let known = &mut largest[piece as usize];
+            let Ok(piece) = usize::try_from(piece) else { continue };
+            let known = &mut largest[piece];
             *known = if *known == NONE { label } else { label.min(*known) };
         }
         let pixels = self.pixels.iter_mut().zip(pieces).zip(ties);

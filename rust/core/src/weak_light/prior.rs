@@ -30,7 +30,7 @@ const FEWEST: usize = 16;
 pub(crate) struct Prior {
     /// λ, row by row; 0 without a prior.
     pub(crate) weights: Arc<[f64]>,
-    /// The piece of connected pixels of each; [`NONE`] without a measurement.
+    /// The piece of connected pixels of each; [`NONE`] without a measurement, and in a piece without λ.
     pub(crate) pieces: Arc<[i32]>,
     /// The mean of M in each piece.
     means: Vec<f64>,
@@ -118,8 +118,17 @@ pub(super) fn scatter(weights: &[f64], sensitivity: &[f64], mean: f64) -> f64 {
 }
 
 impl Prior {
-    pub(crate) fn new(weights: Arc<[f64]>, pieces: Arc<[i32]>) -> Self {
+    pub(crate) fn new(weights: Arc<[f64]>, mut pieces: Arc<[i32]>) -> Self {
         let count = pieces.iter().max().map_or(0, |&last| (last + 1) as usize);
+        let mut has_weight = vec![false; count];
+        for (&weight, &piece) in weights.iter().zip(&*pieces).filter(|(_, piece)| **piece != NONE) {
+            has_weight[piece as usize] |= weight > 0.0;
+        }
+        if has_weight.contains(&false) {
+            // Its mean may be 0.
+            let weighs = |piece: i32| usize::try_from(piece).is_ok_and(|piece| has_weight[piece]);
+            pieces = pieces.iter().map(|&piece| if weighs(piece) { piece } else { NONE }).collect();
+        }
         Self { weights, pieces, means: vec![1.0; count], common: vec![0.0; count] }
     }
 
@@ -169,4 +178,21 @@ fn means(pieces: &[i32], count: usize, value: impl Fn(usize) -> f64) -> Vec<f64>
         *sum = (sum.0 + value(pixel), sum.1 + 1.0);
     }
     sums.into_iter().map(|(sum, count)| sum / count).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_piece_without_weights_has_no_part_in_it() {
+        let mut prior = Prior::new(vec![2.0, 0.0, 0.0].into(), vec![1, 1, 0].into());
+        // Of mean 1, with 1 − M = 0.5 and 0; a step has taken the pixel that is alone to 0.
+        let sensitivity = [0.5, 1.5, 0.0];
+        assert!((prior.at(&sensitivity) - 0.5).abs() < 1e-15);
+        let slopes: Vec<f64> = (0..3).map(|pixel| prior.slope(pixel, sensitivity[pixel])).collect();
+        // λ(1 − M) less the mean of λ(1 − M) M over the piece.
+        assert!((slopes[0] - 0.75).abs() < 1e-15 && (slopes[1] + 0.25).abs() < 1e-15);
+        assert!(slopes[2] == 0.0 && prior.curvature(2) == 0.0 && prior.curvature(0) == 2.0);
+    }
 }
