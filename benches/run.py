@@ -25,6 +25,7 @@ import reporting
 import response
 import subpixel
 import uncertainty
+import watching
 from commands import Row
 from peers import table as peers
 
@@ -57,6 +58,7 @@ def main(*, smoke: bool) -> None:
     rows += reporting.rows((96, 128)) if smoke else reporting.rows()
     lot = {"shape": (96, 128), "sensors": 2, "frames": 2, "repetitions": 1}
     rows += batch.rows(**lot) if smoke else batch.rows()
+    rows += watching.rows((96, 128), frames=2, repetitions=1) if smoke else watching.rows()
     rows += averaging.rows(frames=3, repetitions=1) if smoke else averaging.rows()
     rows += response.rows(shape=(24, 32), repetitions=1) if smoke else response.rows()
     rows += scene.rows(shape=(48, 64), frames=3, passes=1) if smoke else scene.rows()
