@@ -64,16 +64,22 @@ def written(folder: Path, shape: tuple[int, int], frames: int) -> Path:
 @contextmanager
 def running(workers: int, manifest: Path, folder: Path) -> Iterator[tuple[str, float]]:
     """Address of a cluster whose workers have evaluated a sensor, and how long its start took."""
+    import dask
     from distributed import LocalCluster
 
     started = time.perf_counter()
-    with LocalCluster(
-        n_workers=workers,
-        threads_per_worker=1,
-        memory_limit=0,
-        dashboard_address="127.0.0.1:0",
-        resources={"equipix-memory": 4e9},
-    ) as cluster:
+    # As docs/batch.md has it for workers of a cluster.
+    setting = {"distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None}
+    with (
+        dask.config.set(setting),
+        LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            memory_limit=0,
+            dashboard_address="127.0.0.1:0",
+            resources={"equipix-memory": 4e9},
+        ) as cluster,
+    ):
         taken = time.perf_counter() - started
         # As many sensors as workers, so that each has imported all that it needs.
         first = [manifest, *sorted(folder.glob("s*/experiment.toml"))[1:workers]]

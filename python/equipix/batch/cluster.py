@@ -144,6 +144,15 @@ def _distributed() -> Any:
     return distributed
 
 
+_SETTINGS = {
+    # Some seconds after a worker was lost, the cluster ends one of its name for good if it is just
+    # being started again: one that is killed twice.
+    "distributed.deploy.lost-worker-timeout": "1 day",
+    # A worker would give each array back to the system, and wait for new pages a third of its time.
+    "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None,
+}
+
+
 @contextmanager
 def scheduler_at(
     scheduler: str | None, memory: Sequence[int], workers: int | None = None
@@ -158,17 +167,17 @@ def scheduler_at(
     distributed = _distributed()
     import dask
 
-    cluster = distributed.LocalCluster(
-        n_workers=count,
-        threads_per_worker=max(1, processors // count),
-        processes=True,
-        memory_limit=0,
-        dashboard_address="127.0.0.1:0",
-        resources={_MEMORY: free // count},
-    )
-    # Some seconds after a worker was lost, the cluster ends one of its name for good if it is just
-    # being started again: one that is killed twice.
-    with dask.config.set({"distributed.deploy.lost-worker-timeout": "1 day"}), cluster:
+    with (
+        dask.config.set(_SETTINGS),
+        distributed.LocalCluster(
+            n_workers=count,
+            threads_per_worker=max(1, processors // count),
+            processes=True,
+            memory_limit=0,
+            dashboard_address="127.0.0.1:0",
+            resources={_MEMORY: free // count},
+        ) as cluster,
+    ):
         yield cluster.scheduler_address
 
 
