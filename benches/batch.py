@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from commands import Row
+from commands import Row, measure
 
 from equipix import batch, demo
 from equipix.batch.evaluation import Job, evaluate
@@ -33,6 +33,7 @@ def rows(
                 seconds[workers] = timed(lot, folder, address)
                 if workers == 1:
                     added = what_one_takes(lot[0], folder, address, repetitions)
+        moved = what_one_moves(lot[0], folder)
     size = f"{shape[1]}×{shape[0]}"
     efficiency = seconds[1] / seconds[2] / 2
     alone, there = np.median(added, axis=0)
@@ -50,6 +51,12 @@ def rows(
             f"{there / alone - 1:.1%}",
             f"{there:.2f} s, in this process {alone:.2f} s, one thread each, medians of "
             f"{repetitions} in turn; the start of a cluster, {starts[0]:.1f} s, apart",
+        ),
+        (
+            f"what one sensor of {size} takes in a batch",
+            "",
+            f"{moved[0]:.2f} GB of memory, {moved[1]:.0f} MB read, {moved[2]:.1f} MB written",
+            f"{frames} frames of 16 bits of each position and of the dark; its page is written too",
         ),
     ]
 
@@ -119,6 +126,19 @@ def timed_alone(manifest: Path, folder: Path) -> float:
     if row.status != "done":
         raise RuntimeError(row.reason)
     return taken
+
+
+def what_one_moves(manifest: Path, folder: Path) -> tuple[float, float, float]:
+    """Gigabytes of memory of a process, megabytes of its inputs and of what it writes."""
+    with tempfile.TemporaryDirectory(dir=folder) as output:
+        command = ("batch", str(manifest), "-o", output, "--workers", "1")
+        memory = measure(command).gigabytes
+        return memory, megabytes(manifest.parent), megabytes(Path(output))
+
+
+def megabytes(folder: Path) -> float:
+    """Size of all files in a folder."""
+    return sum(each.stat().st_size for each in folder.rglob("*") if each.is_file()) / 1e6
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ use std::ops::Range;
 use super::flux::{Flux, FluxKind};
 use super::measurements::{Measurements, Variance};
 use super::positions::Positions;
-use super::stretch::{Stretch, weigh};
+use super::stretch::{Stretch, weigh, weigh_roughly};
 use super::tally::{Tally, check_light, tally};
 use crate::control::Control;
 use crate::error::{Error, Result};
@@ -312,11 +312,22 @@ impl<'a, T: Real> Exposures<'a, T> {
         Stretch::Weighted(values, weights)
     }
 
+    /// The weights of a row of `exposure` times `factor`, at most `largest`, to single precision.
+    pub(crate) fn rough_weights(
+        &self,
+        exposure: usize,
+        row: usize,
+        [factor, largest]: [f64; 2],
+        weights: &mut [f32],
+    ) {
+        weigh_roughly(&self.measurements, exposure, row, [factor, largest], weights);
+    }
+
     /// The weight of an exposure's measurements if it is the same for all and all are used.
     pub(crate) fn uniform_weight(&self, exposure: usize) -> Option<f64> {
         let tally = self.checked.tallies.get(exposure);
         let whole = tally.is_some_and(|tally| tally.used == self.sensor().len());
         let same = !matches!(self.measurements.variance, Variance::Measurements(_));
-        (whole && same).then(|| self.measurements.exposure_weight(exposure))
+        (whole && same).then(|| 1.0 / self.measurements.exposure_variance(exposure))
     }
 }

@@ -87,10 +87,10 @@ impl<T> Measurements<'_, T> {
         }
     }
 
-    /// The weight of an exposure's measurements where it is the same for all.
-    pub(crate) fn exposure_weight(&self, exposure: usize) -> f64 {
+    /// The variance of an exposure's measurements where it is the same for all.
+    pub(crate) fn exposure_variance(&self, exposure: usize) -> f64 {
         match self.variance {
-            Variance::Exposures(variance) => 1.0 / variance[exposure],
+            Variance::Exposures(variance) => variance[exposure],
             _ => 1.0,
         }
     }

@@ -392,21 +392,16 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         &self,
         exposure: usize,
         row: usize,
-        scratch: &'s mut WeightScratch,
+        scratch: &'s mut Vec<f32>,
     ) -> RowWeight<'s> {
         let factor = self.exposures.flux()[exposure].powi(2) / self.scale.weight;
         if let Some(weight) = self.exposures.uniform_weight(exposure) {
             return RowWeight::Same((weight * factor).min(LARGEST) as f32);
         }
-        let cols = self.exposures.sensor().cols;
-        scratch.double.resize(cols, 1.0);
-        scratch.padded.resize(2 * self.padding.lead + self.padding.width, 0.0);
-        let padded = &mut scratch.padded[self.padding.lead..][..cols];
-        let _ = self.exposures.stretch(exposure, row, 0..cols, &mut scratch.double);
-        for (padded, weight) in padded.iter_mut().zip(&scratch.double) {
-            *padded = (weight * factor).min(LARGEST) as f32;
-        }
-        RowWeight::Padded(&scratch.padded)
+        scratch.resize(2 * self.padding.lead + self.padding.width, 0.0);
+        let weights = &mut scratch[self.padding.lead..][..self.exposures.sensor().cols];
+        self.exposures.rough_weights(exposure, row, [factor, LARGEST], weights);
+        RowWeight::Padded(scratch)
     }
 
     pub(crate) fn scratch(&self) -> Scratch {
@@ -421,14 +416,8 @@ pub(crate) struct Scratch {
 
 #[derive(Clone, Default)]
 pub(super) struct ExposureScratch {
-    pub(super) weight: WeightScratch,
+    pub(super) weight: Vec<f32>,
     pub(super) noise: Vec<f32>,
-}
-
-#[derive(Clone, Default)]
-pub(super) struct WeightScratch {
-    double: Vec<f64>,
-    padded: Vec<f32>,
 }
 
 /// A draw of noise, by its number.
