@@ -12,7 +12,9 @@ import numpy as np
 from commands import Row, measure
 
 from equipix import batch, demo
-from equipix.batch.evaluation import Job, evaluate
+from equipix.batch.cluster import SETTINGS
+from equipix.batch.evaluation import Job, described_by, evaluate
+from equipix.batch.memory import bytes_needed
 from equipix.report.limits import LimitsFile
 
 if TYPE_CHECKING:
@@ -55,8 +57,10 @@ def rows(
         (
             f"what one sensor of {size} takes in a batch",
             "",
-            f"{moved[0]:.2f} GB of memory, {moved[1]:.0f} MB read, {moved[2]:.1f} MB written",
-            f"{frames} frames of 16 bits of each position and of the dark; its page is written too",
+            f"{moved[0]:.2f} GB of memory of {moved[1]:.2f} reserved, {moved[2]:.0f} MB read, "
+            f"{moved[3]:.0f} MB written",
+            f"{frames} frames of 16 bits of each position and of the dark, and images of the hole: "
+            f"{moved[4]:.0f} MB; its page is written too",
         ),
     ]
 
@@ -75,10 +79,8 @@ def running(workers: int, manifest: Path, folder: Path) -> Iterator[tuple[str, f
     from distributed import LocalCluster
 
     started = time.perf_counter()
-    # As docs/batch.md has it for workers of a cluster.
-    setting = {"distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None}
     with (
-        dask.config.set(setting),
+        dask.config.set(SETTINGS),
         LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
@@ -128,12 +130,21 @@ def timed_alone(manifest: Path, folder: Path) -> float:
     return taken
 
 
-def what_one_moves(manifest: Path, folder: Path) -> tuple[float, float, float]:
-    """Gigabytes of memory of a process, megabytes of its inputs and of what it writes."""
+def what_one_moves(manifest: Path, folder: Path) -> tuple[float, ...]:
+    """Gigabytes of memory, and those reserved; megabytes read, written, and of its inputs."""
+    reserved = bytes_needed(described_by(manifest), {}) / 1e9
+    before = bytes_read()
+    timed_alone(manifest, folder)
+    read = (bytes_read() - before) / 1e6
     with tempfile.TemporaryDirectory(dir=folder) as output:
         command = ("batch", str(manifest), "-o", output, "--workers", "1")
         memory = measure(command).gigabytes
-        return memory, megabytes(manifest.parent), megabytes(Path(output))
+        return memory, reserved, read, megabytes(Path(output)), megabytes(manifest.parent)
+
+
+def bytes_read() -> int:
+    """Bytes that this process has read so far, those that memory held among them."""
+    return int(Path("/proc/self/io").read_text().split()[1])
 
 
 def megabytes(folder: Path) -> float:

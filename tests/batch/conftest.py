@@ -2,15 +2,15 @@
 
 import pytest
 
+from equipix.batch.cluster import SETTINGS
+
 
 @pytest.fixture(scope="module")
 def cluster():
     """Two worker processes of one thread each."""
     distributed = pytest.importorskip("distributed")
-    # Without it a worker that is killed again and again ends for good, as in cluster.py.
-    kept = {"distributed.deploy.lost-worker-timeout": "1 day"}
     with (
-        pytest.importorskip("dask").config.set(kept),
+        pytest.importorskip("dask").config.set(SETTINGS),
         distributed.LocalCluster(
             n_workers=2,
             threads_per_worker=1,

@@ -20,8 +20,8 @@ import pytest
 
 import equipix
 from equipix import batch, errors, simulate
-from equipix.batch.cluster import Task, finished
-from equipix.batch.evaluation import Job, Row, described_by, evaluate, refuse_taken
+from equipix.batch.cluster import Task, finished, scheduler_at
+from equipix.batch.evaluation import Job, Row, _flagged, described_by, evaluate, refuse_taken
 from equipix.io.formats import checked, with_checksum
 from equipix.io.tiff import write_frames
 from equipix.report.limits import LimitsFile, limits_template
@@ -153,10 +153,23 @@ def test_maps_show_where_sensors_are_flagged_and_beyond_a_limit():
         f"{share} with pixels flagged 'do not use' there": 0.5,
         f"{share} with pixels flagged 'dead' there": 0.5,
         f"{share} with pixels flagged 'hot' there": 0.0,
-        f"{share} beyond the limit of flagged share, with flagged pixels there": 0.25,
+        f"{share} beyond the limit of share of flagged pixels, with flagged pixels there": 0.25,
     }
     assert {name: values[0, 0] for name, values in maps.items()} == wanted
     assert all(values.ravel()[1:].max() == 0 for values in maps.values())
+
+
+@pytest.mark.parametrize(
+    ("shape", "places"), [((96, 128), (36, 48)), ((30, 20), (30, 20)), ((4, 1000), (1, 48))]
+)
+def test_parts_of_a_map_are_about_square(shape, places):
+    flags = np.zeros(shape, np.uint32)
+    flags[0, 0] = equipix.Flag.DEAD
+    shares = np.array(_flagged(flags)["DEAD"])
+    rows, cols = (length // count for length, count in zip(shape, places, strict=True))
+    assert shares.shape == places
+    assert shares[0, 0] == pytest.approx(1 / (rows * cols), abs=1e-6)  # rounded to six digits
+    assert shares.sum() == shares[0, 0]
 
 
 @pytest.mark.long
@@ -177,6 +190,16 @@ def test_a_killed_worker_is_replaced(lot, tmp_path, cluster):
     with Client(cluster) as client:
         client.wait_for_workers(2)
         assert not set(client.run(os.getpid).values()) & set(before.values())
+
+
+@pytest.mark.long
+def test_workers_of_this_machine_keep_freed_memory():
+    from distributed import Client
+
+    with scheduler_at(None, [10**8], workers=1) as address, Client(address) as client:
+        client.wait_for_workers(1)
+        (known,) = client.run(lambda: dict(os.environ)).values()
+    assert "MALLOC_TRIM_THRESHOLD_" not in known
 
 
 @pytest.mark.long

@@ -220,6 +220,19 @@ def test_a_move_with_another_bright_place_is_found_in_whole_images():
         found_in(discs((400, 700, 30, 3000), large), after)
 
 
+def test_what_is_wrong_beyond_the_part_around_the_spots_is_refused():
+    before, after = discs((400, 700, 30, 3000)), discs((410, 689, 30, 3000), seed=1)
+    with pytest.raises(InputError, match="shape"):
+        found_in(before, after[:, :-1])
+    with pytest.raises(InputError, match="shape"):
+        found_in(before, after, hot=np.zeros((1099, 1300), bool))
+    for place in (1000, 1001):  # one of them is not looked at coarsely
+        broken = after.astype(np.float32)
+        broken[1, place, place] = np.nan
+        with pytest.raises(InputError, match="NaN"):
+            found_in(before.astype(np.float32), broken)
+
+
 def test_far_moves_take_a_larger_region_and_most_of_a_sensor_is_all_of_it():
     far = moves_of([(700, 900)], [(0, 0), (0, 210)])
     rows, cols = region_of_spots(far, (1600, 2400), (1, 1))

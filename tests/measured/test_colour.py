@@ -115,3 +115,14 @@ def test_a_pattern_that_may_stand_out_is_looked_for(period):
         assert _may_repeat(image)
     flat = rng.normal(1, 0.02, size)
     assert not _may_repeat(flat)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.15, 0.3, 0.45])
+@pytest.mark.parametrize("outlier", [0.7, 1.4, 10.0])
+def test_outliers_of_one_side_hide_no_pattern(share, outlier):
+    rng = np.random.default_rng(round(100 * share))
+    for levels, scatter in (((0.95, 1.05), 0.005), ((0.95, 1.05), 0.01), ((1, 1, 1, 1.1), 0.01)):
+        response = np.resize(levels, (128, 128))
+        image = response * rng.normal(1, scatter, response.shape)
+        image[rng.random(response.shape) < share] = outlier
+        assert _may_repeat(image)

@@ -144,13 +144,14 @@ def _distributed() -> Any:
     return distributed
 
 
-_SETTINGS = {
+SETTINGS = {
     # Some seconds after a worker was lost, the cluster ends one of its name for good if it is just
     # being started again: one that is killed twice.
     "distributed.deploy.lost-worker-timeout": "1 day",
     # A worker would give each array back to the system, and wait for new pages a third of its time.
     "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None,
 }
+"""Of dask, for a cluster on this machine; docs/batch.md has those for others."""
 
 
 @contextmanager
@@ -168,7 +169,7 @@ def scheduler_at(
     import dask
 
     with (
-        dask.config.set(_SETTINGS),
+        dask.config.set(SETTINGS),
         distributed.LocalCluster(
             n_workers=count,
             threads_per_worker=max(1, processors // count),

@@ -35,7 +35,12 @@ from equipix.shown import Brief
 Described = Experiment | LevelExperiment | CameraExperiment
 
 _PLACES = 48
-"""Most rows and columns of the map of flagged pixels that a row holds."""
+"""Most rows and columns of the map of flagged pixels that a row holds; its parts are as square as
+whole pixels allow."""
+
+
+_FORM = 2
+"""Form of a row: a sensor whose row has another one is evaluated again."""
 
 
 class Job(NamedTuple):
@@ -148,6 +153,7 @@ def key_of(job: Job, described: Described) -> str:
     }
     known = {
         "version": __version__,
+        "form": _FORM,
         "inputs": inputs,
         "options": dict(job.options),
         "partial": job.partial,
@@ -281,7 +287,8 @@ def _flagged(flags: Array) -> dict[str, list[list[float]]]:
 
 
 def _shares(pixels: Bools) -> list[list[float]]:
-    rows, cols = (np.linspace(0, n, min(n, _PLACES) + 1).astype(int) for n in pixels.shape)
+    side = max(1, max(pixels.shape) / _PLACES)
+    rows, cols = (np.linspace(0, n, max(1, round(n / side)) + 1).astype(int) for n in pixels.shape)
     sums = np.add.reduceat(np.add.reduceat(pixels, rows[:-1], 0, int), cols[:-1], 1)
     shares = sums / np.outer(np.diff(rows), np.diff(cols))
     return [[round(float(share), 6) for share in row] for row in shares]

@@ -16,6 +16,7 @@ from equipix.batch.evaluation import Row
 from equipix.errors import EquipixError
 from equipix.findings import Finding, Findings, Flag, Severity
 from equipix.io.paths import write_whole
+from equipix.report.figures import name_of
 from equipix.report.maps import Map
 from equipix.report.page import Part, Table, drawn, mapped, page, write_page
 from equipix.shown import Brief
@@ -31,8 +32,8 @@ _ANY = str(Flag.DO_NOT_USE.name)
 _MOST_NAMED = 10
 """Most sensors that a finding of the lot names."""
 
-_NO_TRENDS = ("components", "sweeps", "order")
-"""Figures that say nothing of a sensor."""
+_NO_TRENDS = ("components", "sweeps", "order", "sensitivity_mean")
+"""Figures that say nothing of a sensor: the mean of M is 1 by definition."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +156,7 @@ class Lot(Brief):
         """Yield by limit, and the sensors with links to their pages."""
         if self.yields:
             shares = [
-                (name.replace("_", " "), f"{100 * good / of:.1f} %", str(good), str(of))
+                (name_of(name), f"{100 * good / of:.1f} %", str(good), str(of))
                 for name, (good, of) in self.yields.items()
             ]
             yield Table("Yield by limit", ("figure", "yield", "pass", "judged"), shares)
@@ -163,7 +164,7 @@ class Lot(Brief):
             (
                 row.sensor,
                 row.verdict or row.status,
-                row.reason or ", ".join(each["kind"] for each in row.findings) or "no finding",
+                row.reason or "; ".join(_against(row)) or "no finding",
             )
             for row in self.rows
         ]
@@ -185,7 +186,7 @@ class Lot(Brief):
             for limit in limits:
                 failed = [row for row in rows if limit in _beyond(row)]
                 if any(_ANY in row.flagged for row in failed):
-                    words = f"beyond the limit of {limit.replace('_', ' ')}"
+                    words = f"beyond the limit of {name_of(limit)}"
                     where = _where(failed, _ANY) * (len(failed) / len(rows))
                     yield Map(f"Share {of} {words}, with flagged pixels there", "", where)
 
@@ -212,6 +213,12 @@ def _beyond(row: Row) -> list[str]:
     return [each["figure"] for each in row.limits if each["verdict"] == "FAIL"]
 
 
+def _against(row: Row) -> list[str]:
+    """What speaks against a sensor: kinds of findings, and figures beyond their limits."""
+    beyond = [f"beyond the limit of {name_of(each)}" for each in _beyond(row)]
+    return [each["kind"].replace("_", " ") for each in row.findings] + beyond
+
+
 def _some(names: list[str]) -> str:
     more = len(names) - _MOST_NAMED
     return ", ".join(names[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
@@ -229,7 +236,7 @@ def _draw(name: str, values: list[float | None], axes: Any) -> None:
     known = [np.nan if value is None else value for value in values]
     axes.plot(range(1, len(known) + 1), known, "o", markersize=3)
     axes.set_xlabel("sensor, in the order of the table")
-    axes.set_title(name.replace("_", " "))
+    axes.set_title(name_of(name))
 
 
 def refuse_no_parquet() -> None:

@@ -269,14 +269,16 @@ def _found(
 ) -> tuple[ShiftMeasurement, tuple[int, int], float]:
     """Find the spots of a move in raw images, the shape of the sensor, and a spot's radius.
 
-    Around the spots, where a coarse look shows that they are the only ones, else in whole images:
-    so these say what is wrong with them.
+    Around the spots, where a coarse look at images of whole numbers shows that they are the only
+    ones, else in whole images: so these say what is wrong with them.
     """
     raw = images()
     first = [next(frames) for frames in raw]
     rows, cols = first[0].shape[1:]
+    shapes = {(rows, cols), first[1].shape[1:], (rows, cols) if hot is None else hot.shape}
+    is_plain = len(shapes) == 1 and all(each.dtype.kind == "u" for each in first)
     with suppress(InputError):
-        if (around := _around_spots(first, level, hot)) is not None:
+        if is_plain and (around := _around_spots(first, level, hot)) is not None:
             region, radius = around
             parts = [
                 np.concatenate([each[:, *region] for each in chain([start], frames)])
@@ -288,7 +290,8 @@ def _found(
     del raw, first
     before, after = (np.concatenate(list(frames)) for frames in images())
     found = measure_shift(before, after, saturation=level, hot=hot)
-    return found, (rows, cols), _size(before[0], found.before.position)[0]
+    spots = ((before[0], found.before), (after[0], found.after))
+    return found, (rows, cols), max(_size(image, spot.position)[0] for image, spot in spots)
 
 
 _COARSE = 512
@@ -304,7 +307,7 @@ def _around_spots(
 ) -> tuple[tuple[slice, slice], float] | None:
     """Part of the images that holds all that is bright, and the radius of the larger spot.
 
-    None where that is most of the sensor, or where it is small.
+    None where that part is most of the sensor, or where the sensor is small.
     """
     shape = images[0].shape[1:]
     step = min(shape) // _COARSE

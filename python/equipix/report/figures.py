@@ -361,7 +361,7 @@ FIGURES = {
     "colour_response": ("mean response of each colour (M has mean 1 within each)", ""),
     "sensitivity_mean": ("mean of M", ""),
     "sensitivity_spread": ("spread of M", ""),
-    "sensitivity_std": ("standard deviation of M, median", ""),
+    "sensitivity_std": ("median standard deviation of M", ""),
     "sensitivity_std_is_exact_to": ("relative error of the standard deviation of M", ""),
     "tilt": ("tilt of M, edge to edge", ""),
     "tilt_std": ("standard deviation of the tilt", ""),
@@ -381,6 +381,7 @@ FIGURES = {
     "th": ("columns and time th", ""),
     "vh": ("pixels vh", ""),
     "tvh": ("pixels and time tvh", ""),
+    "flagged_share": ("share of flagged pixels", ""),
     "sweeps": ("passes of the solver over the data", ""),
     "components": ("separate parts of the sensor", ""),
     "orientation": ("orientation of the shifts", ""),
@@ -414,7 +415,7 @@ def words_of(
     left_out = {*without} | ({"shift_sign"} if "orientation" in figures else set())
     return [
         (
-            FIGURES.get(key, (key.replace("_", " "), ""))[0],
+            name_of(key),
             "{} rows × {} columns".format(*value)
             if key == "shape"
             else in_words(value, _unit(key)),
@@ -422,6 +423,11 @@ def words_of(
         for key, value in figures.items()
         if key not in left_out
     ]
+
+
+def name_of(key: str) -> str:
+    """Name of a figure in words."""
+    return FIGURES.get(key, (key.replace("_", " "), ""))[0]
 
 
 def _unit(key: str) -> str:
