@@ -306,6 +306,9 @@ fn the_noise_of_a_dark_adds_to_the_misfit() {
         let negligible = NEGLIGIBLE * case.known().count() as f64;
         let inexact = if mean <= negligible { negligible } else { LACK * mean };
         assert!((found - mean).abs() <= 4.0 * standard_error + inexact, "{found} {mean}");
+        if mean <= negligible {
+            assert!(found >= mean - 4.0 * standard_error, "an upper limit: {found} {mean}");
+        }
     }
 }
 

@@ -234,11 +234,11 @@ impl Solution<'_> {
         information::of_sensor(exposures, self.flux, light, workers, control)
     }
 
-    /// What errors of such variances that all exposures share, as those of a dark, leave in F once M has followed them: an
-    /// upper limit of what they add to it, since the beam follows too.
+    /// Upper limit of what errors of such variances that all exposures share, as those of a dark, add to F
+    /// on average: M follows them here, but not the beam.
     ///
     /// # Errors
-    /// As [`information`](Self::information).
+    /// As [`information`](Self::information), and [`Error::Memory`] if the memory for it cannot be had.
     pub(crate) fn left_of_common<T: Real>(
         &self,
         exposures: &Exposures<'_, T>,

@@ -4,6 +4,7 @@ use crate::control::Control;
 use crate::error::Result;
 use crate::exposures::{Exposures, Stretch};
 use crate::frames::Real;
+use crate::memory;
 use crate::parallel::Workers;
 
 /// D of all pixels, row by row, with the light L that `light(k)` gives of each exposure; light that is
@@ -24,6 +25,9 @@ pub(crate) fn of_sensor<T: Real>(
         control.check()?;
         let light = light(k);
         workers.map_blocks(&mut information, cols, |row, sums| {
+            if control.is_cancelled() {
+                return;
+            }
             add(exposures, k, [row, 0], flux, &light[row * cols..][..cols], sums);
         });
     }
@@ -31,11 +35,14 @@ pub(crate) fn of_sensor<T: Real>(
     Ok(information)
 }
 
-/// Σ w − (Σ w c L)²/(D + λ) of all pixels, with λ of `prior`, times `variance`, summed: what is left in F of errors of
-/// such variances that all exposures share, once M has followed them.
+/// The part of F by errors of such variances that all exposures share, M eliminated, with λ of `prior`:
+///
+/// ```text
+/// Σ_p v (Σ_k w − (Σ_k w c L)²/(D + λ))
+/// ```
 ///
 /// # Errors
-/// As [`of_sensor`].
+/// [`Error::Memory`](crate::Error::Memory) if the memory for it cannot be had; else as [`of_sensor`].
 pub(crate) fn left_of_common<T: Real>(
     exposures: &Exposures<'_, T>,
     [flux, prior, variance]: [&[f64]; 3],
@@ -44,11 +51,16 @@ pub(crate) fn left_of_common<T: Real>(
     control: &Control,
 ) -> Result<f64> {
     let (sensor, cols) = (exposures.sensor(), exposures.sensor().cols);
+    // Three sums and the light of each pixel.
+    memory::check(32 * sensor.len() as u64, || format!("the misfit of the dark of {sensor}"))?;
     let mut moments = workers.filled(sensor.len(), [0.0; 3], control);
     for (k, &flux) in flux.iter().enumerate() {
         control.check()?;
         let light = light(k);
         workers.map_blocks(&mut moments, cols, |row, moments| {
+            if control.is_cancelled() {
+                return;
+            }
             each(exposures, k, [row, 0], flux, &light[row * cols..][..cols], |i, weight, light| {
                 let [all, along, square] = &mut moments[i];
                 *all += weight;
@@ -61,8 +73,9 @@ pub(crate) fn left_of_common<T: Real>(
         let first = row * cols;
         let of_pixel = |(i, [all, along, square]): (usize, &[f64; 3])| {
             let prior = prior.get(first + i).copied().unwrap_or_default();
-            let left = if *square > 0.0 { all - along * along / (square + prior) } else { 0.0 };
-            variance[first + i] * left
+            let left = if *square > 0.0 { all - along * (along / (square + prior)) } else { 0.0 };
+            // Below 0 only by rounding, where all exposures see the same light.
+            variance[first + i] * left.max(0.0)
         };
         moments.iter().enumerate().map(of_pixel).sum::<f64>()
     });
@@ -95,8 +108,8 @@ pub(crate) fn add<T: Real>(
     each(exposures, k, pixel, flux, light, |i, weight, light| sums[i] += weight * light * light);
 }
 
-/// Calls `take` with the place along the light, w and c L of the measurements of exposure `k` from a pixel on along
-/// its row.
+/// Calls `take` with the place along the light, w and c L of the measurements of exposure `k` from a
+/// pixel on along its row.
 fn each<T: Real>(
     exposures: &Exposures<'_, T>,
     k: usize,

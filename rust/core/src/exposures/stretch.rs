@@ -95,3 +95,53 @@ fn fill<T: Real, W: Copy + Default>(
     let mask = mask.row(exposure, row, frames.shape()).map(|mask| &mask[cols]);
     pulp::Arch::new().dispatch(Weigh { values, variance, mask, same, weights, inverse });
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::exposures::Mask;
+    use crate::frames::{Shape, Stack};
+
+    /// Every third value is none, every fifth is masked; variances go to both ends of what is allowed.
+    fn row(width: usize) -> (Vec<f64>, Vec<f64>, Vec<bool>) {
+        let values = (0..width).map(|i| if i % 3 == 1 { f64::NAN } else { i as f64 - 2.0 });
+        let powers = (0..width).map(|i| [-100, 0, 3, -7, 100, -30, 12][i % 7]);
+        let mask = (0..width).map(|i| i % 5 == 2).collect();
+        (values.collect(), powers.map(|power| 1.7 * 10_f64.powi(power)).collect(), mask)
+    }
+
+    #[test]
+    fn weights_are_inverse_variances_of_what_is_used() {
+        for width in 1..=20 {
+            let (values, variances, masked) = row(width);
+            let frames = Stack::new("frames", &values, 1, Shape::new(1, width)).unwrap();
+            let each = Stack::new("variance", &variances, 1, Shape::new(1, width)).unwrap();
+            for variance in
+                [Variance::Unknown, Variance::Exposures(&[4.0]), Variance::Measurements(each)]
+            {
+                for mask in [Mask::None, Mask::Pixels(&masked)] {
+                    let measurements = Measurements { frames, variance, mask };
+                    let (mut double, mut single) = (vec![9.0; width], vec![9.0_f32; width]);
+                    let _ = weigh(&measurements, 0, 0, 0..width, &mut double);
+                    weigh_roughly(&measurements, 0, 0, [2.5, 1e12], &mut single);
+                    for i in 0..width {
+                        let used = values[i].is_finite()
+                            && !(masked[i] && matches!(mask, Mask::Pixels(_)));
+                        let variance = match variance {
+                            Variance::Unknown => 1.0,
+                            Variance::Exposures(_) => 4.0,
+                            Variance::Measurements(_) => variances[i],
+                        };
+                        let wanted = if used { 1.0 / variance } else { 0.0 };
+                        assert_eq!(double[i].to_bits(), f64::to_bits(wanted));
+                        let wanted = (2.5 * wanted).min(1e12);
+                        // The variance in these units and the quotient are rounded; below what single
+                        // precision holds it is 0.
+                        let rounding = 2.0 * f64::from(f32::EPSILON) * wanted + 1e-38;
+                        assert!((f64::from(single[i]) - wanted).abs() <= rounding, "{width} {i}");
+                    }
+                }
+            }
+        }
+    }
+}

@@ -138,3 +138,57 @@ pub(super) fn check_light(tallies: &[Tally]) -> Result<()> {
     }
     Ok(())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::exposures::Mask;
+    use crate::frames::Stack;
+
+    #[test]
+    fn counts_are_those_of_a_plain_loop_and_a_bad_variance_is_named() {
+        let (workers, control) = (Workers::new(None).unwrap(), Control::new());
+        for width in 1..=20 {
+            let shape = Shape::new(2, width);
+            let sizes = [3.0, -8.0, f64::NAN, 0.5, 0.0, -0.25, f64::INFINITY];
+            let values: Vec<f64> =
+                (0..2 * width).map(|i| sizes[i % 7] * (1.0 + i as f64)).collect();
+            let mask: Vec<bool> = (0..2 * width).map(|i| i % 5 == 3).collect();
+            let mut variances = vec![0.5; 2 * width];
+            let tally = |variances: &[f64]| {
+                let frames = Stack::new("frames", &values, 1, shape)?;
+                let variance = Variance::Measurements(Stack::new("variance", variances, 1, shape)?);
+                let measurements = Measurements { frames, variance, mask: Mask::Pixels(&mask) };
+                super::tally(&measurements, 0, &workers, &control)
+            };
+            let used: Vec<f64> = (0..2 * width).filter(|&i| !mask[i]).map(|i| values[i]).collect();
+            let used: Vec<f64> = used.into_iter().filter(|value| value.is_finite()).collect();
+            let found = tally(&variances).unwrap();
+            assert_eq!(found.used, used.len());
+            assert_eq!(found.positive, used.iter().filter(|value| **value > 0.0).count());
+            assert_eq!(found.weight.to_bits(), (2.0 * used.len() as f64).to_bits());
+            assert_eq!(
+                found.largest,
+                used.iter().fold(0.0, |top: f64, value| top.max(value.abs()))
+            );
+            for bad in [0.9e-100, 1.1e100, 0.0, -1.0, f64::NAN, f64::INFINITY] {
+                for at in 0..2 * width {
+                    variances[at] = bad;
+                    let is_used = !mask[at] && values[at].is_finite();
+                    match tally(&variances) {
+                        Ok(_) => assert!(!is_used, "{bad} at {at}"),
+                        Err(error) => {
+                            let place = format!("row {}, column {}", at / width, at % width);
+                            assert!(is_used && error.to_string().contains(&place), "{error}");
+                        }
+                    }
+                    variances[at] = 0.5;
+                }
+            }
+            for good in [1e-100, 0.999e100] {
+                variances[2 * width - 1] = good;
+                assert!(tally(&variances).is_ok(), "{good}");
+            }
+        }
+    }
+}

@@ -147,12 +147,8 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
         variance
     }
 
-    /// What the noise of the dark adds to F, on average; 0 without a dark.
+    /// What the noise of the dark adds to F, on average.
     pub(super) fn misfit_by_dark(&mut self, control: &Control) -> Result<f64> {
-        if !self.search.reduced.has_dark() {
-            return Ok(0.0);
-        }
-        self.smallest = Smallest::default();
         mean_misfit(self.count, |draw| {
             let search = &mut self.search;
             let left = search.reduced.draw(Draw::Dark(draw), &mut search.residual, control)?;

@@ -21,9 +21,9 @@ const FAINTEST: f64 = 1e-24;
 const CHANGE: f64 = 4.0;
 /// Bytes for each pixel and each cell of each view that the first D takes: D, M and L.
 const BYTES: [u64; 2] = [16, 8];
-/// Bytes that a prior takes likewise: λ, λ in the units of the search and pieces; and the components that these
-/// are (`connectivity.rs`).
-const BYTES_OF_PRIOR: [u64; 2] = [16 + 22, 13];
+/// Bytes that a prior takes likewise: λ, λ in the units of the search and pieces; those of a prior that leaves
+/// pieces out, of this one and the one before; and the components that pieces are (`connectivity.rs`).
+const BYTES_OF_PRIOR: [u64; 2] = [16 + 8 + 22, 13];
 
 /// A linear problem in which light may be weak.
 pub(crate) trait Problem<T: Real> {

@@ -125,7 +125,7 @@ impl Prior {
             has_weight[piece as usize] |= weight > 0.0;
         }
         if has_weight.contains(&false) {
-            // Its mean may be 0.
+            // The mean of a piece may be 0, and with it a slope 0/0.
             let weighs = |piece: i32| usize::try_from(piece).is_ok_and(|piece| has_weight[piece]);
             pieces = pieces.iter().map(|&piece| if weighs(piece) { piece } else { NONE }).collect();
         }
