@@ -497,7 +497,7 @@ def test_memory_does_not_grow_with_frames_and_levels(tmp_path):
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     # Each mean of a level that was kept would add an image of 16 bits or more, 36 in all. Names and
-    # settings of 36 files more, of 1 kB each, and what waits for the garbage collector are below one.
+    # settings of 36 files more, of 1 kB each, and what waits to be collected are below one.
     assert peaks[1] < peaks[0] + 240 * 320 * 2
 
 
