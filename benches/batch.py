@@ -35,7 +35,7 @@ def rows(
                 seconds[workers] = timed(lot, folder, address)
                 if workers == 1:
                     added = what_one_takes(lot[0], folder, address, repetitions)
-        moved = what_one_moves(lot[0], folder)
+        memory, reserved, read, output, inputs = what_one_moves(lot[0], folder)
     size = f"{shape[1]}×{shape[0]}"
     efficiency = seconds[1] / seconds[2] / 2
     alone, there = np.median(added, axis=0)
@@ -57,10 +57,10 @@ def rows(
         (
             f"what one sensor of {size} takes in a batch",
             "",
-            f"{moved[0]:.2f} GB of memory of {moved[1]:.2f} reserved, {moved[2]:.0f} MB read, "
-            f"{moved[3]:.0f} MB written",
+            f"{memory:.2f} GB of memory of {reserved:.2f} reserved, {read:.0f} MB read, "
+            f"{output:.0f} MB written",
             f"{frames} frames of 16 bits of each position and of the dark, and images of the hole: "
-            f"{moved[4]:.0f} MB; its page is written too",
+            f"{inputs:.0f} MB; its page is written too",
         ),
     ]
 
