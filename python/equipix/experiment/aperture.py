@@ -320,7 +320,8 @@ def _around_spots(
     sizes = [_size(frames[0], spot) for frames, spot in zip(images, spots, strict=True)]
     radius = max(radius for radius, _ in sizes)
     shifts = np.array([[0.0, 0.0], step * coarse.shift])
-    region = region_of_spots(Moves(shifts, shifts, np.array(spots), radius), shape, (1, 1))
+    moves = Moves(shifts, np.zeros_like(shifts), np.array(spots), radius)
+    region = region_of_spots(moves, shape, (1, 1))
     if region is None:
         return None
     for frames, (_, half) in zip(images, sizes, strict=True):

@@ -167,9 +167,12 @@ def _around(residual: NDArray[Any], where: NDArray[np.bool_]) -> NDArray[Any]:
     return np.asarray(mean / max(1.0, ROBUST * _median(mean, where)))
 
 
-def weights_of(variance: Array | None, exposure: int, used: Bools) -> Array:
-    """Weights 1/σ² of an exposure; 0 where nothing is used."""
-    scale = 1.0 if variance is None else variance[exposure]
+def weights_of(
+    variance: Array | None, exposure: int, used: Bools, rows: slice = slice(None)
+) -> Array:
+    """Weights 1/σ² of some rows of an exposure; 0 where nothing is used."""
+    scale = np.asarray(1.0 if variance is None else variance[exposure])
+    used, scale = used[rows], scale[rows] if scale.ndim else scale
     return np.asarray(np.divide(1.0, scale, where=used, out=np.zeros(used.shape)))
 
 

@@ -188,8 +188,8 @@ def std_of_pixels(weighted: Weighted, workers: int | None) -> tuple[Array, Array
     It is 1/√D. The noise of a dark adds at most v Σw/D, which it adds where all exposures show the
     same light.
     """
-    exposures, variance = weighted.exposures, weighted.exposures.variance
-    information, noise = weighted.fit.information(workers=workers), weighted.noise_variance
+    exposures, noise = weighted.exposures, weighted.noise_variance
+    information = weighted.fit.information(workers=workers)
     without = np.empty(exposures.shape)
     with np.errstate(divide="ignore"):
         for rows in blocks(exposures.shape):
@@ -200,9 +200,7 @@ def std_of_pixels(weighted: Weighted, workers: int | None) -> tuple[Array, Array
         for k in range(len(exposures)):
             used = exposures.used(weighted.fit, k)
             for rows in blocks(exposures.shape):
-                is_map = variance is not None and variance.ndim == 3
-                part = variance[:, rows] if is_map and variance is not None else variance
-                found[rows] += weights_of(part, k, used[rows])
+                found[rows] += weights_of(exposures.variance, k, used, rows)
         for rows in blocks(exposures.shape):
             total = noise + exposures.dark_variance[rows] * found[rows]
             found[rows] = 1 / np.sqrt(information[rows] / total)

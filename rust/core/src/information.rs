@@ -19,19 +19,10 @@ pub(crate) fn of_sensor<T: Real>(
     workers: &Workers,
     control: &Control,
 ) -> Result<Vec<f64>> {
-    let (sensor, cols) = (exposures.sensor(), exposures.sensor().cols);
-    let mut information = workers.filled(sensor.len(), 0.0, control);
-    for (k, &flux) in flux.iter().enumerate() {
-        control.check()?;
-        let light = light(k);
-        workers.map_blocks(&mut information, cols, |row, sums| {
-            if control.is_cancelled() {
-                return;
-            }
-            add(exposures, k, [row, 0], flux, &light[row * cols..][..cols], sums);
-        });
-    }
-    control.check()?;
+    let mut information = workers.filled(exposures.sensor().len(), 0.0, control);
+    gather(exposures, flux, light, &mut information, workers, control, |sum, weight, light| {
+        *sum += weight * light * light;
+    })?;
     Ok(information)
 }
 
@@ -54,21 +45,12 @@ pub(crate) fn left_of_common<T: Real>(
     // Three sums and the light of each pixel.
     memory::check(32 * sensor.len() as u64, || format!("the misfit of the dark of {sensor}"))?;
     let mut moments = workers.filled(sensor.len(), [0.0; 3], control);
-    for (k, &flux) in flux.iter().enumerate() {
-        control.check()?;
-        let light = light(k);
-        workers.map_blocks(&mut moments, cols, |row, moments| {
-            if control.is_cancelled() {
-                return;
-            }
-            each(exposures, k, [row, 0], flux, &light[row * cols..][..cols], |i, weight, light| {
-                let [all, along, square] = &mut moments[i];
-                *all += weight;
-                *along += weight * light;
-                *square += weight * light * light;
-            });
-        });
-    }
+    gather(exposures, flux, light, &mut moments, workers, control, |sums, weight, light| {
+        let [all, along, square] = sums;
+        *all += weight;
+        *along += weight * light;
+        *square += weight * light * light;
+    })?;
     let of_rows = workers.map_blocks(&mut moments, cols, |row, moments| {
         let first = row * cols;
         let of_pixel = |(i, [all, along, square]): (usize, &[f64; 3])| {
@@ -106,6 +88,32 @@ pub(crate) fn add<T: Real>(
     sums: &mut [f64],
 ) {
     each(exposures, k, pixel, flux, light, |i, weight, light| sums[i] += weight * light * light);
+}
+
+/// Calls `take` with what is summed of a pixel, w and c L of each of its measurements, exposure by exposure.
+fn gather<T: Real, S: Send>(
+    exposures: &Exposures<'_, T>,
+    flux: &[f64],
+    light: impl Fn(usize) -> Vec<f64>,
+    sums: &mut [S],
+    workers: &Workers,
+    control: &Control,
+    take: impl Fn(&mut S, f64, f64) + Sync + Send,
+) -> Result<()> {
+    let cols = exposures.sensor().cols;
+    for (k, &flux) in flux.iter().enumerate() {
+        control.check()?;
+        let light = light(k);
+        workers.map_blocks(sums, cols, |row, sums| {
+            if control.is_cancelled() {
+                return;
+            }
+            each(exposures, k, [row, 0], flux, &light[row * cols..][..cols], |i, weight, light| {
+                take(&mut sums[i], weight, light);
+            });
+        });
+    }
+    control.check()
 }
 
 /// Calls `take` with the place along the light, w and c L of the measurements of exposure `k` from a
