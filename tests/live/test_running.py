@@ -261,26 +261,25 @@ def test_too_few_positions_are_named() -> None:
 def test_adding_and_advising_at_582_by_782() -> None:
     shape, shifts = (582, 782), np.array([(0, 0), (0, 11), (0, 19), (11, 0), (19, 0), (40, 33)])
     dark, frames = frames_of(shape, shifts)
-    averages = np.mean(frames, axis=1) - dark.mean(axis=0)
-
-    def seconds() -> tuple[float, float, float, float]:
-        running = running_of(dark, frames[:5], shifts[:5])
-        running.estimate()
+    running = running_of(dark, frames[:5], shifts[:5])
+    running.estimate()
+    seconds = []
+    for frame in frames[5]:
         started = time.perf_counter()
-        running.add(frames[5][0], shifts[5])
-        added = time.perf_counter()
-        running.add(frames[5][1], shifts[5])
-        begun = time.perf_counter()
-        running.estimate()
-        estimated = time.perf_counter()
-        running.needed()
-        needed = time.perf_counter()
+        running.add(frame, shifts[5])
+        seconds.append(time.perf_counter() - started)
+    assert max(seconds) < 0.04
+    started = time.perf_counter()
+    running.estimate()
+    estimate = time.perf_counter() - started
+    started = time.perf_counter()
+    running.needed()
+    assert time.perf_counter() - started < 5
+    averages, seconds = np.mean(frames, axis=1) - dark.mean(axis=0), []
+    for _ in range(3):
+        started = time.perf_counter()
         equipix.calibrate(averages, shifts)
-        ended = time.perf_counter()
-        return (added - started, estimated - begun, needed - estimated, ended - needed)
-
-    # Seconds differ between machines: benches/watching.py measures those wanted.
-    add, estimate, needed, calibrate = np.median([seconds() for _ in range(3)], axis=0)
-    assert add < 0.1 * calibrate  # wanted 40 ms, where calibrate takes some 0.4 s
-    assert estimate < 5 * calibrate  # usual 3: fits of weights
-    assert needed < 5 * calibrate  # wanted 5 s; usual 0.7
+        seconds.append(time.perf_counter() - started)
+    # Machines differ: benches/watching.py measures the second that is wanted. Usual is 3, since
+    # weights take longer than their absence.
+    assert estimate < 5 * np.median(seconds)
