@@ -26,6 +26,17 @@ def raw():
     return means + np.sqrt(4 + 0.3 * means) * rng.standard_normal((5, 16, *truth.shape))
 
 
+@pytest.mark.filterwarnings("ignore::equipix.errors.ConvergenceWarning")
+@pytest.mark.parametrize("unit", [2.0**-10, 2.0**10])
+def test_a_unit_that_rounds_nothing_changes_no_bit(raw, unit):
+    plain, scaled = (
+        equipix.calibrate([equipix.average(u * each) for each in raw], CROSS, max_sweeps=15)
+        for u in (1, unit)
+    )
+    np.testing.assert_array_equal(scaled.sensitivity, plain.sensitivity)
+    assert scaled.reduced_chi2 == plain.reduced_chi2
+
+
 @pytest.mark.parametrize("unit", [1e-3, 0.1, 1e3])
 def test_the_unit_of_the_frames_plays_no_part(raw, unit):
     options = {"max_sweeps": 15, "tolerance": 1e-9}
