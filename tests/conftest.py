@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
 import statistics
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -52,6 +54,13 @@ def stops_within():
         return first < limit_s or statistics.median([first, measure(), measure()]) < limit_s
 
     return check
+
+
+@pytest.fixture
+def hashing_by_one_thread(monkeypatch):
+    """Each thread that hashes a file has a buffer: as many as happen to run would be the peak."""
+    one = functools.partial(ThreadPoolExecutor, 1)
+    monkeypatch.setattr("equipix.experiment.image_files.ThreadPoolExecutor", one)
 
 
 @pytest.fixture

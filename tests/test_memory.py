@@ -328,6 +328,7 @@ def peak_of(arguments):
 @pytest.mark.parametrize("command", ["quality", "defects"])
 @pytest.mark.parametrize("filters", [[], ["--cfa", "RGGB"]], ids=["plain", "colours"])
 @pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+@pytest.mark.usefixtures("hashing_by_one_thread")
 def test_memory_does_not_grow_with_the_frames_of_a_level(tmp_path, command, filters, dtype):
     """Eight times as many files take less than one more frame."""
     shape = (200, 300)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 import json
 import re
 import shutil
 import tracemalloc
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -487,10 +485,8 @@ def test_photons_in_another_unit_are_named(camera, tmp_path):
 
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore::equipix.errors.InputWarning")  # few levels
-def test_memory_does_not_grow_with_frames_and_levels(tmp_path, monkeypatch):
-    # Each thread that hashes a file has a buffer: as many as happen to run would be the peak.
-    one_thread = functools.partial(ThreadPoolExecutor, 1)
-    monkeypatch.setattr("equipix.experiment.image_files.ThreadPoolExecutor", one_thread)
+@pytest.mark.usefixtures("hashing_by_one_thread")
+def test_memory_does_not_grow_with_frames_and_levels(tmp_path):
     peaks = []
     few, many = {"count": 6, "spatial": 2}, {"count": 24, "frames": 8, "spatial": 32}
     for k, options in enumerate((few, many)):
