@@ -13,6 +13,7 @@ __all__ = [
     "Exposures",
     "Fit",
     "SceneCorrection",
+    "Start",
     "Uncertainty",
     "__version__",
     "adapt_words",
@@ -132,7 +133,7 @@ class Exposures:
         method: str,
         tolerance: float,
         max_sweeps: int | None,
-        start: Fit | None,
+        start: Start | None,
         workers: int | None,
         progress: _Progress | None,
     ) -> Fit: ...
@@ -168,6 +169,10 @@ class Beam:
         *,
         workers: int | None,
     ) -> NDArray[Any]: ...
+
+@final
+class Start:
+    """Where another fit begins, which takes it."""
 
 @final
 class Fit:
@@ -217,6 +222,7 @@ class Fit:
     def refinement(self) -> str: ...
     @property
     def is_joint(self) -> bool: ...
+    def start(self) -> Start: ...
     def information(self, *, workers: int | None) -> NDArray[Any]: ...
     def dark_misfit(self, dark_variance: NDArray[Any], *, workers: int | None) -> float: ...
     def uncertainty(

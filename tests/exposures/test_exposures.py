@@ -129,11 +129,14 @@ def test_a_start_at_the_solution_saves_passes_and_keeps_the_answer():
     for places in (np.rint(shifts), shifts):
         exposures = exposures_of(frames, places)
         cold = exposures.fit(options)
-        warm = exposures.fit(options, cold)
+        start = cold.start()
+        warm = exposures.fit(options, start)
         assert warm.ended == "converged"
         assert warm.sweeps[-1] < 0.8 * cold.sweeps[-1]
         # Each is within the tolerance of the minimum, as estimated: three times for the estimate.
         np.testing.assert_allclose(warm.sensitivity, cold.sensitivity, rtol=3 * 2 * 1e-6)
+        with pytest.raises(InputError, match="'start' was taken by another fit"):
+            exposures.fit(options, start)
 
 
 def test_exposures_cannot_be_changed():

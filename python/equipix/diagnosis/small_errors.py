@@ -177,8 +177,9 @@ def small_errors(weighted: Weighted, options: FitOptions) -> list[SmallError]:
 @if_there_is_light()
 def _tested(weighted: Weighted, options: FitOptions) -> list[SmallError] | None:
     """Each error that is larger than noise."""
-    window, start = window_of(weighted.exposures, weighted.fit)
+    window, known = window_of(weighted.exposures, weighted.fit)
     exact = FitOptions(tolerance=_TOLERANCE, max_sweeps=_PRODUCTS, workers=options.workers)
+    start = None if known is None else known.start()
     part = with_dark_misfit(Weighted(window, window.fit(exact, start), None), Options(options))
     here = _Fitted.of(window, part.fit, options)
     fit, own, signal = part.fit, here.residuals, here.signal
@@ -206,7 +207,7 @@ def _tested(weighted: Weighted, options: FitOptions) -> list[SmallError] | None:
         # The mean over both signs of the noise has only what is quadratic in it.
         if not noisy:
             both = (simulated(part, options, sign) for sign in (1, -1))
-            noisy = [_Fitted.of(each, each.fit(exact, fit), options) for each in both]
+            noisy = [_Fitted.of(each, each.fit(exact, fit.start()), options) for each in both]
         by_noise = np.mean([each.product(cause, exact) for each in noisy], axis=0)
         estimate = (product - float(by_noise.sum())) / power
         if not abs(estimate) < cause.most:
@@ -259,7 +260,7 @@ class _Fitted(NamedTuple):
         size = _STEP * float(np.sqrt(np.nanmean(signal**2) / np.nanmean(error**2)))
         values = window.values + np.nan_to_num(size * error).astype(window.values.dtype)
         changed = dataclasses.replace(window, values=values)
-        fit = changed.fit(options, self.fit)
+        fit = changed.fit(options, self.fit.start())
         left = _scaled(changed, fit, changed.residuals(fit, options.workers)) - self.residuals
         return left / size, fit, size
 

@@ -26,7 +26,7 @@ from equipix._check import (
     positive_workers,
     union,
 )
-from equipix._native import Fit
+from equipix._native import Fit, Start
 from equipix.errors import InputError
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Positions, name_of, nearest_whole
@@ -263,8 +263,8 @@ class Exposures(Measured):
         plain = dataclasses.replace(self, bad_pixels=BadPixels(), filters=None)
         return plain.part(self.middle(side))
 
-    def fit(self, options: FitOptions, start: Fit | None = None) -> Fit:
-        """Fit sensitivity, beam and the other unknowns, from `start` if it is given.
+    def fit(self, options: FitOptions, start: Start | None = None) -> Fit:
+        """Fit sensitivity, beam and the other unknowns, from `start` on, which it takes.
 
         Raises
         ------

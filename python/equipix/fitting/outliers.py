@@ -244,7 +244,7 @@ def without_fallen_dust(
         moment = np.where(found, first, moment)
         before = np.arange(len(exposures))[:, None, None] < moment
         exposures = exposures.without(before).marked(contradictory=moment > 0)
-        fit = exposures.fit(options, fit)
+        fit = exposures.fit(options, fit.start())
         if edges:
             break
     return exposures, fit

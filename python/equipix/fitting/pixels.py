@@ -63,7 +63,7 @@ def _without(weighted: Weighted, dead: Bools, hot: Bools, options: Options) -> W
     before = weighted.exposures.bad_pixels
     exposures = weighted.exposures.without(dead | hot)
     exposures = exposures.marked(dead=union(before.dead, dead), hot=union(before.hot, hot))
-    return weighted._replace(exposures=exposures, fit=exposures.fit(options.fit, weighted.fit))
+    return weighted.again(exposures, options.fit)
 
 
 def _of_cells(weighted: Weighted, squares: Floats) -> Floats:
@@ -141,7 +141,7 @@ def without_faint_pixels(weighted: Weighted, options: Options) -> Weighted:
     if not faint.any():
         return weighted
     exposures = exposures.marked(faint=faint)
-    return weighted._replace(exposures=exposures, fit=exposures.fit(options.fit, weighted.fit))
+    return weighted.again(exposures, options.fit)
 
 
 def _faint(std: Array) -> Bools:

@@ -72,9 +72,8 @@ def widened(weighted: Weighted, options: Options) -> Weighted:
     exposures = weighted.exposures
     for each in found:
         exposures = _wider(exposures, each)
-    fit = exposures.fit(options.fit, weighted.fit)
     replaced = {**weighted.replaced, **{each.name: each.words for each in found}}
-    return weighted._replace(exposures=exposures, fit=fit, replaced=replaced)
+    return weighted.again(exposures, options.fit)._replace(replaced=replaced)
 
 
 def _of_fluxes(weighted: Weighted) -> Contradiction | None:
@@ -201,7 +200,7 @@ def steadied(weighted: Weighted, exposures: Exposures, options: Options) -> Weig
         for k, (signal, each) in enumerate(in_dn)
     )
     exposures = dataclasses.replace(exposures, variance=None, noise=models)
-    steady = weighted_fit(exposures, options, weighted.fit)
+    steady = weighted_fit(exposures, options, weighted.fit.start())
     return steady._replace(replaced={"variance": words(frames)})
 
 

@@ -8,12 +8,12 @@ import dataclasses
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from equipix._check import Array, Bools, Floats, union
-from equipix._native import Fit
+from equipix._native import Fit, Start
 from equipix.errors import InputError
 from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.fitting.outliers import rejected, without_fallen_dust
@@ -106,6 +106,10 @@ class Weighted(NamedTuple):
     excess: float = 1.0
     replaced: Mapping[str, str] = MappingProxyType({})
 
+    def again(self, exposures: Exposures, options: FitOptions) -> Self:
+        """Fit other exposures, beginning at this fit."""
+        return self._replace(exposures=exposures, fit=exposures.fit(options, self.fit.start()))
+
     @property
     def reduced_chi2(self) -> float:
         """F over that expected, or the variance of a value of weight 1; NaN where undetermined."""
@@ -140,7 +144,7 @@ class Weighted(NamedTuple):
         return self.excess if self.exposures.knows_noise else self.reduced_chi2
 
 
-def weighted_fit(exposures: Exposures, options: Options, start: Fit | None = None) -> Weighted:
+def weighted_fit(exposures: Exposures, options: Options, start: Start | None = None) -> Weighted:
     """Fit exposures whose weights may depend on the fit.
 
     Variances by a noise model are evaluated at what a first fit expects. That fit is at the nearest
@@ -157,15 +161,15 @@ def weighted_fit(exposures: Exposures, options: Options, start: Fit | None = Non
         at_medians = (c * middle for c in exposures.flux.values)
         nearest = exposures.at(dataclasses.replace(exposures.positions.whole(), std=None))
         variances = np.empty_like(exposures.values)
-        start = modelled(nearest, at_medians, variances).fit(rough, start)
-        signals = expected(exposures, start, middle, options.fit.workers)
+        fit = modelled(nearest, at_medians, variances).fit(rough, start)
+        signals = expected(exposures, fit, middle, options.fit.workers)
         # Nothing is asked of the rough fit any more that would need its variances.
         exposures = modelled(exposures, signals, variances)
-        del nearest, at_medians, variances, signals
+        start = fit.start()
+        del nearest, at_medians, variances, signals, fit
         if not options.robust:
             middle = None
     fit = exposures.fit(options.fit, start)
-    del start
     if options.robust:
         return _robust_fit(exposures, options.fit, fit, middle)
     return Weighted(exposures, fit, None)
@@ -193,7 +197,9 @@ def _robust_fit(
             signals = expected(exposures, fit, middle, options.workers)
             exposures = modelled(exposures, signals, np.empty_like(exposures.values))
         kept = contradictory_found(exposures.without(~usable | out), given)
-        fit = kept.fit(options, fit)
+        start = fit.start()
+        del fit
+        fit = kept.fit(options, start)
     return Weighted(kept, fit, out | (given & ~usable))
 
 

@@ -100,7 +100,7 @@ class WindowFit:
         tolerance, most, start = _COARSE, _MOST_COARSE, None
         if before is not None:
             tolerance = max(_FINER * before.noise, np.finfo(float).eps)
-            most, start = _MOST_FINE, before.fit
+            most, start = _MOST_FINE, before.fit.start()
         progress = staged(options.progress, "sign of shifts")
         stop = FitOptions("multiscale", tolerance, most, options.workers, progress)
         fit = window.fit(stop, start)
@@ -261,7 +261,7 @@ def of_noise(weighted: Weighted, options: FitOptions) -> OfNoise | None:
     if fit is None:
         part = with_dark_misfit(Weighted(window, window.fit(options), None), Options(options))
     right = simulated(part, options)
-    other = Weighted(right, right.fit(options, part.fit), None)
+    other = Weighted(right, right.fit(options, part.fit.start()), None)
     residuals = sampled(other, workers=options.workers)
     exact = residuals.inexactness <= EXACT
     found = OfNoise(part, other, residuals)

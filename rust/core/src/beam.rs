@@ -27,6 +27,15 @@ pub struct Beam<V = Vec<f64>> {
     pub origin: [f64; 2],
 }
 
+impl Beam<&[f64]> {
+    /// The same beam, copied.
+    pub(crate) fn copied(&self) -> Beam {
+        let Self { tilt, shape, origin, .. } = *self;
+        let coefficients = self.coefficients.map(<[f64]>::to_vec);
+        Beam { values: self.values.to_vec(), coefficients, tilt, shape, origin }
+    }
+}
+
 impl<V: AsRef<[f64]> + Sync> Beam<V> {
     /// The same beam, borrowed.
     pub fn view(&self) -> Beam<&[f64]> {

@@ -88,7 +88,13 @@ pub struct Fit {
 }
 
 impl Fit {
-    /// The part of it that questions and a later start need.
+    /// Where another fit may begin: at this one.
+    #[must_use]
+    pub fn start(&self) -> Start {
+        self.solution().start()
+    }
+
+    /// The part of it that questions need.
     #[must_use]
     pub fn solution(&self) -> Solution<'_> {
         Solution {
@@ -159,7 +165,25 @@ impl Fit {
     }
 }
 
-/// A fit, borrowed: what error bars are asked of, and what another fit may start from.
+/// Where another fit begins, which gives it up once it has.
+#[derive(Clone, Debug)]
+pub struct Start {
+    pub(crate) sensitivity: Vec<f64>,
+    pub(crate) beam: Beam,
+    pub(crate) flux: Vec<f64>,
+    pub(crate) shifts: Vec<[f64; 2]>,
+    pub(crate) refinement: Refinement,
+}
+
+impl Start {
+    /// Checks that it is of as many exposures of the same sensor.
+    pub(crate) fn check<T: Real>(&self, exposures: &Exposures<'_, T>) -> Result<()> {
+        let of = [self.flux.len(), self.shifts.len()];
+        check_sizes(of, &[self.sensitivity.len()], exposures)
+    }
+}
+
+/// A fit, borrowed: what error bars are asked of.
 #[derive(Clone, Debug)]
 pub struct Solution<'s> {
     /// M in the gauge mean(M) = 1, row by row; NaN where undetermined.
@@ -185,21 +209,23 @@ pub struct Solution<'s> {
 }
 
 impl Solution<'_> {
+    /// Where another fit may begin: at this one.
+    #[must_use]
+    pub fn start(&self) -> Start {
+        Start {
+            sensitivity: self.sensitivity.to_vec(),
+            beam: self.beam.copied(),
+            flux: self.flux.to_vec(),
+            shifts: self.shifts.to_vec(),
+            refinement: self.refinement,
+        }
+    }
+
     /// Checks that it is one of as many exposures of the same sensor, and what it lost too.
     pub(crate) fn check<T: Real>(&self, exposures: &Exposures<'_, T>) -> Result<()> {
-        let (count, pixels) = (exposures.count(), exposures.sensor().len());
-        if self.flux.len() == count
-            && self.shifts.len() == count
-            && self.sensitivity.len() == pixels
-            && self.flags.len() == pixels
-        {
-            return self.check_lost(count, pixels);
-        }
-        Err(Error::Shape {
-            argument: "start",
-            got: format!("{} exposures of {} pixels", self.flux.len(), self.sensitivity.len()),
-            wanted: format!("{count} exposures of {pixels} pixels"),
-        })
+        let of = [self.flux.len(), self.shifts.len()];
+        check_sizes(of, &[self.sensitivity.len(), self.flags.len()], exposures)?;
+        self.check_lost(exposures.count(), exposures.sensor().len())
     }
 
     fn check_lost(&self, count: usize, pixels: usize) -> Result<()> {
@@ -265,4 +291,21 @@ impl Solution<'_> {
         lost.iter().for_each(|&pixel| light[pixel] = f64::NAN);
         light
     }
+}
+
+/// Checks that arrays `of` exposures and of `pixels` have the lengths of those of these exposures.
+fn check_sizes<T: Real>(
+    of: [usize; 2],
+    pixels: &[usize],
+    exposures: &Exposures<'_, T>,
+) -> Result<()> {
+    let (count, wanted) = (exposures.count(), exposures.sensor().len());
+    if of.iter().all(|&of| of == count) && pixels.iter().all(|&pixels| pixels == wanted) {
+        return Ok(());
+    }
+    Err(Error::Shape {
+        argument: "start",
+        got: format!("{} exposures of {} pixels", of[0], pixels[0]),
+        wanted: format!("{count} exposures of {wanted} pixels"),
+    })
 }

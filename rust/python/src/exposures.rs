@@ -14,7 +14,7 @@ use pyo3::prelude::*;
 
 use crate::arrays::{either, pairs, rotations};
 use crate::data::{Arrays, Data};
-use crate::fit::{BorrowedFit, PyFit};
+use crate::fit::{PyFit, PyStart};
 use crate::{errors, run};
 
 /// Mean frames of one beam, and all that is known of them.
@@ -71,22 +71,22 @@ impl PyExposures {
         method: &str,
         tolerance: f64,
         max_sweeps: Option<u64>,
-        start: Option<&Bound<'_, PyFit>>,
+        start: Option<&Bound<'_, PyStart>>,
         workers: Option<NonZeroUsize>,
         progress: Option<Bound<'_, PyAny>>,
     ) -> PyResult<PyFit> {
         let (py, data) = (slf.py(), &slf.get().0);
         let method = method_named(method).map_err(|error| errors::exception(py, &error))?;
         let options = Options { method, tolerance, max_sweeps };
-        let start = start.map(|start| start.get().borrow(py));
-        let start = start.as_ref().map(BorrowedFit::solution).transpose()?;
+        let taken = start.map(|start| start.get().take()).transpose();
+        let start = taken.map_err(|error| errors::exception(py, &error))?;
         let borrowed = data.arrays.borrow(py)?;
         let measurements = borrowed.view()?;
         let fit = run::interruptible(py, progress.as_ref(), |control| {
             let workers = Workers::new(workers)?;
             either!(measurements, m => {
                 let exposures = Exposures::again(m, &data.checked)?;
-                calibrate(&exposures, &options, start.as_ref(), &workers, control)
+                calibrate(&exposures, &options, start, &workers, control)
             })
         })?;
         PyFit::new(py, Arc::clone(data), fit)

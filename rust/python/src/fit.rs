@@ -10,11 +10,11 @@
 //! | lost, an array for each exposure | uintp, 1 | `Vec<&[usize]>` | view |
 
 use std::num::NonZeroUsize;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use equipix_core::{
-    Beam, Control, Ended, Exposures, Fit, History, Look, Real, Refinement, Result, Shape, Solution,
-    Uncertainty, Workers, misfit_by_dark,
+    Beam, Control, Ended, Error, Exposures, Fit, History, Look, Real, Refinement, Result, Shape,
+    Solution, Start, Uncertainty, Workers, misfit_by_dark,
 };
 use numpy::{
     PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3,
@@ -158,6 +158,11 @@ impl PyFit {
         weights.map(|weights| image(py, weights, self.data.checked.sensor())).transpose()
     }
 
+    /// Where another fit may begin: at this one.
+    fn start(&self, py: Python<'_>) -> PyResult<PyStart> {
+        Ok(PyStart(Mutex::new(Some(self.borrow(py).solution()?.start()))))
+    }
+
     /// What became of shifts that were to be refined.
     #[getter]
     const fn refinement(&self) -> &'static str {
@@ -286,6 +291,20 @@ impl PyFit {
             beam: self.beam.get().borrow(py),
             lost: self.lost.iter().map(|pixels| pixels.bind(py).readonly()).collect(),
         }
+    }
+}
+
+/// Where another fit begins, which takes it.
+#[pyclass(frozen, module = "equipix._native", name = "Start")]
+pub(crate) struct PyStart(Mutex<Option<Start>>);
+
+impl PyStart {
+    pub(crate) fn take(&self) -> Result<Start> {
+        let taken = self.0.lock().unwrap_or_else(PoisonError::into_inner).take();
+        taken.ok_or_else(|| Error::Value {
+            argument: "start",
+            problem: "was taken by another fit: ask the fit for one more".into(),
+        })
     }
 }
 

@@ -39,7 +39,7 @@ mod _native {
     #[pymodule_export]
     use crate::exposures::{PyExposures, common_fraction, needs_whole_shifts};
     #[pymodule_export]
-    use crate::fit::{PyBeam, PyFit, PyUncertainty, slope_pixels};
+    use crate::fit::{PyBeam, PyFit, PyStart, PyUncertainty, slope_pixels};
     #[pymodule_export]
     use crate::fixed_point::{adapt_words, apply_words};
     #[pymodule_export]

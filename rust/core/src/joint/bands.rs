@@ -1,8 +1,9 @@
 //! How the sensor is cut into bands of rows for a pass, and where the sums of a band lie.
 
-use super::layout::Window;
-use crate::geometry::Geometry;
+use super::layout::{Grid, Window};
 
+/// Rows of pixels in a band, at least.
+const FEWEST_ROWS: usize = 64;
 /// The most bands, if shifts allow so many: the rows that two bands both add to are kept twice.
 const MOST: usize = 64;
 
@@ -28,14 +29,9 @@ pub(crate) struct Strip {
 }
 
 impl Bands {
-    /// Bands of `fewest` rows of a sensor at least: a band adds to as many rows of cells and those that shifts reach.
-    pub(crate) fn new(
-        windows: &[Window],
-        geometry: &Geometry,
-        width: usize,
-        fewest: usize,
-    ) -> Self {
-        let views = &geometry.views;
+    /// Bands for exposures at these places: a band adds to as many rows of cells and those that shifts reach.
+    pub(crate) fn new(grid: &Grid, windows: &[Window]) -> Self {
+        let (views, rows) = (&grid.geometry.views, grid.sensor.rows);
         let reach = |view: usize| {
             let rows = windows.iter().filter(|window| window.view == view).map(|window| window.row);
             let first = rows.clone().min().unwrap_or(0);
@@ -43,10 +39,10 @@ impl Bands {
         };
         let reaches: Vec<_> = (0..views.len()).map(reach).collect();
         let furthest = reaches.iter().map(|reach| reach.1).max().unwrap_or(0);
-        let height = fewest.max(furthest).max(geometry.sensor.rows / MOST);
+        let height = FEWEST_ROWS.max(furthest).max(rows / MOST);
         let mut length = 0;
         let strips = views.iter().zip(reaches).map(|(view, (first, reach))| {
-            let (rows, cols, start) = (height + reach + width - 1, view.shape.cols, length);
+            let (rows, cols, start) = (height + reach + grid.width - 1, view.shape.cols, length);
             length += rows * cols;
             Strip { first, rows, cols, start }
         });

@@ -1,4 +1,7 @@
 //! Conjugate gradients for the joint problem S x = b, its vectors in single or double precision.
+//!
+//! x is in single precision in either case: its rounding is a share of the step that it is, and the next one
+//! begins from what it leaves.
 
 use super::preconditioner::Preconditioner;
 use super::system::{Precision, System};
@@ -22,10 +25,10 @@ impl Default for Known {
     }
 }
 
-/// A solution in the making, in the units of its numbers ([`Precision::units`]).
+/// A solution in the making, in the units of its numbers ([`Precision::units`]), x in those of single precision.
 #[derive(Default)]
 pub(crate) struct ConjugateGradients<N> {
-    pub(crate) x: Vec<N>,
+    pub(crate) x: Vec<f32>,
     residual: Vec<N>,
     direction: Vec<N>,
     /// S times the direction, then P⁻¹ r.
@@ -57,12 +60,12 @@ impl<N: Precision> ConjugateGradients<N> {
         // First, since it takes the slope's place.
         self.residual = system.slope_in(slope);
         control.check()?;
-        let zeros = || system.pass.workers.filled(self.residual.len(), N::default(), control);
-        let x = zeros();
-        if self.direction.len() != x.len() {
+        let (workers, length) = (system.pass.workers, self.residual.len());
+        if self.direction.len() != length {
+            let zeros = || workers.filled(length, N::default(), control);
             (self.direction, self.product) = (zeros(), zeros());
         }
-        self.x = x;
+        self.x = workers.filled(length, 0.0, control);
         control.check()?;
         preconditioner.apply(system, &self.residual, &mut self.direction, control)?;
         self.square = system.pass.workers.dot(&self.residual, &self.direction);
@@ -73,7 +76,7 @@ impl<N: Precision> ConjugateGradients<N> {
     }
 
     /// The solution, and what is known then.
-    pub(crate) fn found(self) -> (Vec<N>, Known) {
+    pub(crate) fn found(self) -> (Vec<f32>, Known) {
         (self.x, self.known)
     }
 
@@ -106,7 +109,11 @@ impl<N: Precision> ConjugateGradients<N> {
             return Ok(false);
         }
         self.energy += step * self.square;
-        workers.add_multiple(&mut self.x, step, &self.direction);
+        let cells = system.state.beam.len();
+        let ([of_own, _], [of_x, _]) = (system.units::<N>(), system.units::<f32>());
+        let (of_cells, of_others) = self.direction.split_at(cells);
+        workers.add_multiple(&mut self.x[..cells], step * of_own / of_x, of_cells);
+        workers.add_multiple(&mut self.x[cells..], step, of_others);
         control.check()?;
         workers.add_multiple(&mut self.residual, -step, &self.product);
         control.check()?;

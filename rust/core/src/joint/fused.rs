@@ -25,8 +25,6 @@ use crate::error::Result;
 use crate::frames::Real;
 use crate::geometry::{Rotation, TAPS};
 
-/// Rows of pixels in a band, at least.
-const BAND: usize = 64;
 /// Rows of cells that a thread folds at a time.
 const FOLDED: usize = 32;
 /// Rows of cells that a thread converts at a time.
@@ -68,7 +66,7 @@ impl Fused {
         control: &Control,
     ) -> Self {
         let (sensor, count) = (pass.exposures.sensor(), pass.exposures.count());
-        let bands = Bands::new(&pass.windows, &pass.grid.geometry, pass.grid.width, BAND);
+        let bands = Bands::new(&pass.grid, &pass.windows);
         let is_uneven = (0..count).any(|k| pass.exposures.uniform_weight(k).is_none());
         let gain = |k: usize| {
             let even = pass.exposures.uniform_weight(k).filter(|_| !is_uneven);

@@ -6,7 +6,8 @@
 //! ([`Positions::on_grid`](crate::exposures::Positions::on_grid)).
 
 use crate::error::Result;
-use crate::frames::Shape;
+use crate::exposures::Exposures;
+use crate::frames::{Real, Shape};
 use crate::geometry::{Geometry, Rotation, TAPS, Taps};
 
 /// How far a fitted shift may come from where it was measured, in pixels.
@@ -39,6 +40,13 @@ pub(crate) struct Grid {
 }
 
 impl Grid {
+    /// A grid for these exposures.
+    pub(crate) fn of<T: Real>(exposures: &Exposures<'_, T>) -> Result<Self> {
+        let positions = exposures.positions();
+        let shifts = positions.on_grid(&positions.shifts);
+        Self::new(exposures.sensor(), &shifts, &positions.rotations, positions.std.is_some())
+    }
+
     /// A grid for exposures at `shifts`, which may be `fitted`.
     pub(crate) fn new(
         sensor: Shape,

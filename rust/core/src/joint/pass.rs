@@ -21,8 +21,6 @@ use crate::geometry::{Rotation, TAPS, Taps, View};
 use crate::parallel::dot;
 use crate::parallel::{Add, Workers};
 
-/// Rows of pixels in a band, at least.
-const FEWEST_ROWS: usize = 64;
 /// Rows of cells that a thread folds at a time.
 const FOLDED: usize = 16;
 
@@ -87,9 +85,8 @@ impl<'m, 'a, T: Real> Pass<'m, 'a, T> {
 
     /// Where the exposures lie.
     pub(crate) fn place(&mut self, shifts: &[[f64; 2]]) {
-        let Grid { geometry, width, .. } = &self.grid;
         self.windows = self.grid.windows(shifts);
-        self.bands = Bands::new(&self.windows, geometry, *width, FEWEST_ROWS);
+        self.bands = Bands::new(&self.grid, &self.windows);
     }
 
     /// Frees the sums of bands, until the next pass.

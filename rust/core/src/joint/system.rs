@@ -204,15 +204,17 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         self.state.beam.len() + self.fluxes.columns.len() + shifts
     }
 
-    /// Takes a share of a step.
-    pub(crate) fn advance(&mut self, x: &[f64], share: f64) {
-        let cells = self.state.beam.len();
-        self.pass.workers.add_multiple(&mut self.state.beam, share, &x[..cells]);
-        let params = self.state.theta.len();
-        for (theta, step) in self.state.theta.iter_mut().zip(&x[cells..]) {
+    /// Takes a share of a step, which is in the units of single precision.
+    pub(crate) fn advance(&mut self, x: &[f32], share: f64) {
+        let (cells, others) = x.split_at(self.state.beam.len());
+        let [light, _] = self.units::<f32>();
+        self.pass.workers.add_multiple(&mut self.state.beam, share * light, cells);
+        let others: Vec<f64> = others.iter().map(|&x| x.into()).collect();
+        let (theta, moves) = others.split_at(self.state.theta.len());
+        for (theta, step) in self.state.theta.iter_mut().zip(theta) {
             *theta += share * step;
         }
-        let moves = self.centred(&x[cells + params..]);
+        let moves = self.centred(moves);
         let shifts = self.state.shifts.as_flattened_mut().iter_mut();
         shifts.zip(moves.as_flattened()).for_each(|(shift, step)| *shift += share * step);
         if let Some(prior) = &self.shift_prior {
@@ -450,11 +452,20 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         self.divided(step, [of_cell, 1.0])
     }
 
-    /// A step whose numbers had another precision.
-    pub(crate) fn step_of<N: Precision>(&self, step: Vec<N>) -> Vec<f64> {
-        let [of_cell, _] = self.units::<N>();
+    /// A step in the units of single precision, without units.
+    pub(crate) fn step_of(&self, step: Vec<f32>) -> Vec<f64> {
+        let [of_cell, _] = self.units::<f32>();
         let step = step.into_iter().map(Into::into).collect();
         self.divided(step, [1.0 / of_cell, 1.0])
+    }
+
+    /// How far F falls along a step in the units of single precision, to first order and by halves, in the unit of
+    /// slopes of fluxes and shifts there.
+    pub(crate) fn fall(&self, step: &[f32], slope: &[f64]) -> f64 {
+        let (workers, cells, [_, of_cell]) =
+            (self.pass.workers, self.state.beam.len(), self.units::<f32>());
+        workers.dot(&step[..cells], &slope[..cells]) / of_cell
+            + workers.dot(&step[cells..], &slope[cells..]) / self.unit_of_other_slopes::<f32>()
     }
 
     /// Values of cells and others, divided by their units.

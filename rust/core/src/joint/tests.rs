@@ -222,7 +222,7 @@ fn is_symmetric_and_the_same(variance: &[f64], mask: &[bool], seeks_more: bool) 
         let rounding = 100.0 * f64::from(f32::EPSILON);
         let size = (dot(&r, &of_r) * dot(&s, &of_s)).sqrt();
         assert!(size > 0.0 && (dot(&r, &of_s) - dot(&s, &of_r)).abs() < rounding * size);
-        let mut single: Vec<f32> = Vec::new();
+        let mut single = Vec::new();
         preconditioner.apply(system, &system.slope_in(r.clone()), &mut single, &control).unwrap();
         let single = system.step_of(single);
         let pairs = single.iter().zip(&of_r).zip(&system.weights);

@@ -9,7 +9,7 @@ use crate::connectivity::{Components, NONE, Tie};
 use crate::control::Control;
 use crate::error::Result;
 use crate::exposures::Exposures;
-use crate::fit::{Fit, Refinement, Solution};
+use crate::fit::{Fit, Refinement, Start};
 use crate::frames::Real;
 use crate::geometry::Geometry;
 use crate::memory;
@@ -33,12 +33,12 @@ use crate::weak_light::Prior;
 pub fn calibrate<T: Real>(
     exposures: &Exposures<'_, T>,
     options: &Options,
-    start: Option<&Solution<'_>>,
+    start: Option<Start>,
     workers: &Workers,
     control: &Control,
 ) -> Result<Fit> {
     refuse::check(exposures, options)?;
-    start.map_or(Ok(()), |start| start.check(exposures))?;
+    start.as_ref().map_or(Ok(()), |start| start.check(exposures))?;
     workers.enter(|| {
         let found = if exposures.are_whole() {
             at_whole_shifts(exposures, options, start, workers, control)?
@@ -60,7 +60,7 @@ pub fn calibrate<T: Real>(
 fn at_whole_shifts<T: Real>(
     exposures: &Exposures<'_, T>,
     options: &Options,
-    start: Option<&Solution<'_>>,
+    start: Option<Start>,
     workers: &Workers,
     control: &Control,
 ) -> Result<Found> {

@@ -14,11 +14,11 @@ const LENGTHS: [f64; 2] = [0.25, 2.5];
 /// A length that is so near to 1 stays.
 const NEAR: f64 = 0.03;
 
-/// The last step.
+/// The last step, in the units of single precision.
 pub(super) struct Course {
-    direction: Vec<f64>,
+    direction: Vec<f32>,
     /// The slope of −F where it began, and the product of that with the step of the linear problem.
-    slope: Vec<f64>,
+    slope: Vec<f32>,
     fall: f64,
     is_measured: bool,
 }
@@ -26,8 +26,8 @@ pub(super) struct Course {
 impl Course {
     /// Makes a step of the linear problem at a `slope` conjugate to the last one.
     pub(super) fn turn(
-        step: &mut [f64],
-        slope: Vec<f64>,
+        step: &mut [f32],
+        slope: Vec<f32>,
         last: Option<&Self>,
         workers: &Workers,
     ) -> Self {
@@ -42,18 +42,22 @@ impl Course {
         Self { direction: step.to_vec(), slope, fall, is_measured: false }
     }
 
-    /// By which multiple of its direction the step is to be made longer, for the slope at its end; once.
-    pub(super) fn missing(&mut self, slope: &[f64], workers: &Workers) -> Option<f64> {
-        if std::mem::replace(&mut self.is_measured, true) || self.slope.len() != slope.len() {
+    /// By which multiple of its direction the step is to be made longer, for how F falls along it at its end; once.
+    pub(super) fn missing(
+        &mut self,
+        fall: impl Fn(&[f32]) -> f64,
+        workers: &Workers,
+    ) -> Option<f64> {
+        if std::mem::replace(&mut self.is_measured, true) {
             return None;
         }
         let first = workers.dot(&self.direction, &self.slope);
-        let length = first / (first - workers.dot(&self.direction, slope));
+        let length = first / (first - fall(&self.direction));
         let believed = LENGTHS[0] < length && length < LENGTHS[1];
         (believed && (length - 1.0).abs() > NEAR).then_some(length - 1.0)
     }
 
-    pub(super) fn direction(&self) -> &[f64] {
+    pub(super) fn direction(&self) -> &[f32] {
         &self.direction
     }
 }
@@ -63,7 +67,7 @@ mod tests {
     use super::*;
 
     /// F = xᵀH x/2 with H = S + E that the steps S⁻¹b of S = 1 do not know.
-    fn slope(x: &[f64]) -> Vec<f64> {
+    fn slope(x: &[f32]) -> Vec<f32> {
         vec![-1.45 * x[0], -0.55 * x[1], -x[2]]
     }
 
@@ -76,13 +80,14 @@ mod tests {
             let mut step = slope(&x);
             let mut course = Course::turn(&mut step, slope(&x), last.as_ref(), &workers);
             workers.add_multiple(&mut x, 1.0, &step);
-            if let Some(missing) = course.missing(&slope(&x), &workers) {
+            let fall = |step: &[f32], x: &[f32]| workers.dot(step, &slope(x));
+            if let Some(missing) = course.missing(|step| fall(step, &x), &workers) {
                 workers.add_multiple(&mut x, missing, course.direction());
             }
-            assert!(course.missing(&slope(&x), &workers).is_none());
+            assert!(course.missing(|step| fall(step, &x), &workers).is_none());
             last = Some(course);
         }
         // A length is off by NEAR at most, which leaves as much of an error of 3.
-        assert!(x.iter().all(|x| x.abs() < 3.0 * NEAR), "{x:?}");
+        assert!(x.iter().all(|x| x.abs() < 3.0 * NEAR as f32), "{x:?}");
     }
 }

@@ -5,7 +5,7 @@ use crate::control::Control;
 use crate::convergence::{Ended, FEWEST_ITERATIONS, History, Look};
 use crate::error::Result;
 use crate::exposures::Exposures;
-use crate::fit::Solution;
+use crate::fit::Start;
 use crate::frames::Real;
 use crate::parallel::Workers;
 use crate::reduced::{ConjugateGradients, Scale, Smallest, Whole};
@@ -28,14 +28,14 @@ const TINY_ERROR: f64 = 1e-9;
 pub(super) fn minimise<'m, 'a, T: Real>(
     exposures: &'m Exposures<'a, T>,
     options: &Options,
-    start: Option<&Solution<'_>>,
+    start: Option<Start>,
     workers: &'m Workers,
     control: &Control,
 ) -> Result<(Estimate<'m, 'a, T>, History, WeakLight, f64)> {
     let limit = options.limit(MOST_SWEEPS)?;
     let mut estimate = Estimate::new(exposures, workers, control);
     if let Some(start) = start {
-        estimate = estimate.at(start.sensitivity);
+        estimate = estimate.at(&start.sensitivity);
     }
     let (scale, mut search) =
         (Scale::of(exposures), ConjugateGradients::new(exposures, workers, control));

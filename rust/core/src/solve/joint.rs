@@ -12,7 +12,7 @@ use crate::convergence::{
 };
 use crate::error::Result;
 use crate::exposures::{Exposures, FluxKind};
-use crate::fit::{Fit, Refinement, Solution};
+use crate::fit::{Fit, Refinement, Start};
 use crate::frames::Real;
 use crate::gauge::FluxGauge;
 use crate::joint::{self, ConjugateGradients, Directions, Known, Precision, Preconditioner};
@@ -57,11 +57,11 @@ const TYPICAL: u64 = 120;
 pub(super) fn minimise<T: Real>(
     exposures: &Exposures<'_, T>,
     options: &Options,
-    start: Option<&Solution<'_>>,
+    start: Option<Start>,
     workers: &Workers,
     control: &Control,
 ) -> Result<Found> {
-    memory::check(joint::bytes_needed(exposures), || {
+    memory::check(joint::bytes_needed(exposures)?, || {
         format!("fitting {} exposures of {} jointly", exposures.count(), exposures.sensor())
     })?;
     let mut steps = Steps::new(exposures, options, start, workers, control)?;
@@ -84,8 +84,8 @@ struct Steps<'m, 'a, T> {
     /// Sweeps that made the first beam.
     swept: u64,
     looks: Vec<Look>,
-    /// The last step.
-    taken: Option<Vec<f64>>,
+    /// The last step, in the units of single precision.
+    taken: Option<Vec<f32>>,
     halvings: i32,
     /// Whether a step raised F at any length.
     stuck: bool,
@@ -103,18 +103,18 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
     fn new(
         exposures: &'m Exposures<'a, T>,
         options: &'m Options,
-        start: Option<&Solution<'_>>,
+        start: Option<Start>,
         workers: &'m Workers,
         control: &Control,
     ) -> Result<Self> {
         let limit = options.limit(MOST_PRODUCTS)?;
-        let (mut system, swept) = start::system(exposures, start, workers, control)?;
+        let (mut system, swept) = start::system(exposures, start.as_ref(), workers, control)?;
         let weak = WeakLight::new();
         let mut shift_prior = ShiftPrior::of(exposures.positions());
         let mut refinement =
             shift_prior.as_ref().map_or(Refinement::None, |_| Refinement::NotTried);
         // Shifts are refined from a beam that is nearly found: that of a start that has refined them.
-        if let Some(start) = start.filter(|start| start.refinement.is_done())
+        if let Some(start) = start.as_ref().filter(|start| start.refinement.is_done())
             && let Some(mut prior) = shift_prior.take()
         {
             refinement = start.refinement;
@@ -188,7 +188,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         self.system.settle();
         // It stays from here on.
         self.taken = None;
-        let kept = self.system.seeks_shifts().then(|| slope.clone());
+        let kept = self.system.seeks_shifts().then(|| self.system.slope_in(slope.clone()));
         let mut search = ConjugateGradients::<N>::after(self.known.clone());
         search.begin(&self.system, preconditioner, slope, control)?;
         let first = search.product(&mut self.system, control)?;
@@ -265,7 +265,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         &mut self,
         mut search: ConjugateGradients<N>,
         first: f64,
-        slope: Option<Vec<f64>>,
+        slope: Option<Vec<f32>>,
         preconditioner: &Preconditioner,
         control: &Control,
     ) -> Result<()> {
@@ -288,9 +288,8 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
                 break;
             }
         }
-        let (x, known) = search.found();
+        let (mut step, known) = search.found();
         self.known = known;
-        let mut step = self.system.step_of(x);
         // A multiple of the beam is no step, but the penalty would see one.
         let cells = self.system.state.beam.len();
         self.system.take_scale_out(&mut step[..cells]);
@@ -309,8 +308,9 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
     /// Brings the last step to the length at which F falls no further along it.
     fn corrects_length(&mut self, slope: &[f64]) -> bool {
         let workers = self.system.pass.workers;
-        let Some(course) = &mut self.course else { return false };
-        let Some(missing) = course.missing(slope, workers) else { return false };
+        let (Some(course), system) = (&mut self.course, &self.system) else { return false };
+        let fall = |direction: &[f32]| system.fall(direction, slope);
+        let Some(missing) = course.missing(fall, workers) else { return false };
         self.system.advance(course.direction(), missing);
         if let Some(taken) = &mut self.taken {
             workers.add_multiple(taken, missing, course.direction());

@@ -18,7 +18,7 @@ use crate::convergence::{
 };
 use crate::error::Result;
 use crate::exposures::Exposures;
-use crate::fit::Solution;
+use crate::fit::Start;
 use crate::frames::Real;
 use crate::parallel::Workers;
 use crate::reduced::{ConjugateGradients, Scale, Smallest, Whole};
@@ -55,7 +55,7 @@ const TYPICAL: u64 = 60;
 pub(crate) fn minimise<'m, 'a, T: Real>(
     exposures: &'m Exposures<'a, T>,
     options: &Options,
-    start: Option<&Solution<'_>>,
+    start: Option<Start>,
     workers: &'m Workers,
     control: &Control,
 ) -> Result<(Estimate<'m, 'a, T>, History, WeakLight)> {
@@ -94,11 +94,12 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
     fn new(
         exposures: &'m Exposures<'a, T>,
         options: &Options,
-        start: Option<&Solution<'_>>,
+        start: Option<Start>,
         workers: &'m Workers,
         control: &Control,
     ) -> Result<Self> {
         let limit = options.limit(MOST_PRODUCTS)?;
+        let by_logarithms = start.is_none() && limit >= TYPICAL;
         Ok(Self {
             limit,
             estimate: start::estimate(exposures, start, workers, control)?,
@@ -110,7 +111,7 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             products: 0,
             looks: Vec::new(),
             // Its products are lost where the light turns out weak: with few there must be none.
-            by_logarithms: start.is_none() && limit >= TYPICAL,
+            by_logarithms,
             length: 1.0,
             halvings: 0,
             rescues: 0,

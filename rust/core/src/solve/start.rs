@@ -4,7 +4,7 @@ use super::descent::one_sweep;
 use crate::control::Control;
 use crate::error::Result;
 use crate::exposures::Exposures;
-use crate::fit::Solution;
+use crate::fit::Start;
 use crate::frames::Real;
 use crate::geometry::nearest_whole;
 use crate::joint::{Fluxes, Grid, ShiftPrior, Source, State, System, first_beam};
@@ -19,13 +19,13 @@ const FIRST_SWEEPS: u64 = 4;
 /// M of another fit, or equal pixels but for those that stand out.
 pub(super) fn estimate<'m, 'a, T: Real>(
     exposures: &'m Exposures<'a, T>,
-    start: Option<&Solution<'_>>,
+    start: Option<Start>,
     workers: &'m Workers,
     control: &Control,
 ) -> Result<Estimate<'m, 'a, T>> {
     let mut estimate = Estimate::new(exposures, workers, control);
     match start {
-        Some(start) => estimate = estimate.at(start.sensitivity),
+        Some(start) => estimate = estimate.at(&start.sensitivity),
         None => estimate.start(control)?,
     }
     Ok(estimate)
@@ -35,13 +35,13 @@ pub(super) fn estimate<'m, 'a, T: Real>(
 /// and how many sweeps that took.
 pub(super) fn system<'m, 'a, T: Real>(
     exposures: &'m Exposures<'a, T>,
-    start: Option<&Solution<'_>>,
+    start: Option<&Start>,
     workers: &'m Workers,
     control: &Control,
 ) -> Result<(System<'m, 'a, T>, u64)> {
     let positions = exposures.positions();
     let (shifts, rotations) = (positions.on_grid(&positions.shifts), &positions.rotations);
-    let grid = Grid::new(exposures.sensor(), &shifts, rotations, positions.std.is_some())?;
+    let grid = Grid::of(exposures)?;
     let fluxes = Fluxes::new(exposures.flux(), exposures.flux_kind(), &shifts, rotations);
     let (state, swept) = match start {
         Some(start) => (moved(start, exposures, &grid, &fluxes, workers, control)?, 0),
@@ -86,7 +86,7 @@ fn swept<T: Real>(
 /// the beam: c L(u) is the same with ln c less by a + γ·d and ln L more by a + γ·u, but for a tilt of
 /// M.
 fn moved<T: Real>(
-    start: &Solution<'_>,
+    start: &Start,
     exposures: &Exposures<'_, T>,
     grid: &Grid,
     fluxes: &Fluxes,
@@ -94,9 +94,10 @@ fn moved<T: Real>(
     control: &Control,
 ) -> Result<State> {
     let positions = exposures.positions();
-    let (theta, level, slope) = fluxes.split(start.flux, start.shifts);
+    let (theta, level, slope) = fluxes.split(&start.flux, &start.shifts);
     let beam = &start.beam;
-    let cells = beam.coefficients.filter(|_| grid.is_spline()).unwrap_or(beam.values);
+    let coefficients = beam.coefficients.as_ref().filter(|_| grid.is_spline());
+    let cells = coefficients.unwrap_or(&beam.values);
     let value = |row: usize, col: usize| {
         let [down, right] = [row as f64 - beam.origin[0], col as f64 - beam.origin[1]];
         let value = cells[row * beam.shape.cols + col];
@@ -109,7 +110,7 @@ fn moved<T: Real>(
     let source = Source { shape: beam.shape, origin, value };
     let mut shifts = positions.on_grid(&positions.shifts);
     if let Some(prior) = ShiftPrior::of(positions).filter(|_| start.refinement.is_done()) {
-        shifts.copy_from_slice(start.shifts);
+        shifts.copy_from_slice(&start.shifts);
         prior.keep_near(&mut shifts);
     }
     Ok(State { beam: first_beam(grid, &source, workers, control)?, theta, shifts })

@@ -98,7 +98,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         workers: &'m Workers,
         control: &Control,
     ) -> Result<Self> {
-        memory::check(joint::bytes_needed_by_covariance(exposures), || {
+        memory::check(joint::bytes_needed_by_covariance(exposures)?, || {
             format!("the uncertainty of {} exposures of {}", exposures.count(), exposures.sensor())
         })?;
         let mut system = problem(exposures, solution, workers, control)?;
@@ -533,11 +533,10 @@ fn problem<'m, 'a, T: Real>(
     workers: &'m Workers,
     control: &Control,
 ) -> Result<System<'m, 'a, T>> {
-    let positions = exposures.positions();
-    let (given, rotations) = (positions.on_grid(&positions.shifts), &positions.rotations);
-    let grid = Grid::new(exposures.sensor(), &given, rotations, positions.std.is_some())?;
+    let (grid, positions) = (Grid::of(exposures)?, exposures.positions());
     let shifts = positions.on_grid(solution.shifts);
-    let fluxes = Fluxes::new(solution.flux, exposures.flux_kind(), &shifts, rotations);
+    let kind = exposures.flux_kind();
+    let fluxes = Fluxes::new(solution.flux, kind, &shifts, &positions.rotations);
     let beam = solution.beam.coefficients.unwrap_or(solution.beam.values);
     let known = |value: &f64| if value.is_finite() { *value } else { 0.0 };
     let state = State {
