@@ -27,23 +27,27 @@ use crate::frames::Real;
 /// # Errors
 /// [`Error::Value`](crate::Error::Value) for shifts that no grid can have.
 pub(crate) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>) -> Result<u64> {
-    let grid = Grid::of(exposures)?;
+    let positions = exposures.positions();
+    let shifts = positions.on_grid(&positions.shifts);
+    Ok(bytes_of(&Grid::of(exposures)?, &shifts, exposures.offset()))
+}
+
+fn bytes_of(grid: &Grid, shifts: &[[f64; 2]], offset: bool) -> u64 {
     let (geometry, sensor) = (&grid.geometry, grid.sensor);
     let (pixels, cells) = (sensor.len() as u64, geometry.beam.len() as u64);
-    let of_pixel = if exposures.offset() { 48 } else { 24 };
-    let positions = exposures.positions();
-    let bands = Bands::new(&grid, &grid.windows(&positions.on_grid(&positions.shifts)));
+    let of_pixel = if offset { 48 } else { 24 };
+    let bands = Bands::new(grid, &grid.windows(shifts));
     // Shifts that are fitted may reach further.
     let reached = geometry.views.iter().map(|view| 2 * MARGIN * view.shape.cols).sum::<usize>();
     let sums = bands.size(sensor.rows) + sensor.rows.div_ceil(bands.height) * reached;
     let views = geometry.views.len() as u64;
     let turned = if views > 1 { 24 * views } else { 0 };
     let rim = 2000 * WIDEST as u64 * (geometry.beam.rows + geometry.beam.cols) as u64;
-    Ok(of_pixel * pixels
+    of_pixel * pixels
         + (30 + 12 + 28 + turned) * cells
         + 8 * sums as u64
         + rim
-        + coarse::bytes_needed(geometry, MOST_WAVES))
+        + coarse::bytes_needed(geometry, MOST_WAVES)
 }
 
 /// What the covariance of a joint fit holds beside the measurements, in bytes: the fit's, and for each
@@ -53,4 +57,20 @@ pub(crate) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>) -> Result<u64>
 /// As [`bytes_needed`].
 pub(crate) fn bytes_needed_by_covariance<T: Real>(exposures: &Exposures<'_, T>) -> Result<u64> {
     Ok(bytes_needed(exposures)? + 112 * exposures.geometry().sensor.len() as u64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::frames::Shape;
+    use crate::geometry::Rotation;
+
+    #[test]
+    fn large_sensors_take_110_bytes_a_pixel() {
+        let sensor = Shape::new(10240, 14648);
+        let shifts = [[0.0; 2], [0.0, 11.3], [0.0, 19.3], [11.3, 0.0], [19.3, 0.0]];
+        let grid = Grid::new(sensor, &shifts, &[Rotation::None; 5], true).unwrap();
+        let of_pixel = bytes_of(&grid, &shifts, false) as f64 / sensor.len() as f64;
+        assert!((105.0..110.5).contains(&of_pixel), "{of_pixel}");
+    }
 }
