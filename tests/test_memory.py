@@ -183,7 +183,9 @@ def test_the_bytes_named_are_those_it_takes(turn):
         {},
         {"uneven": True},
         {"flux": "fit"},
+        {"shift_std": 0.05},
         {"rotation": [0, 0, 0, 0, 90]},
+        {"rotation": [90] * 5, "shift_std": 0.05},
     ],
 )
 def test_a_joint_fit_takes_no_more_bytes_than_it_names(sought):

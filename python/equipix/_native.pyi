@@ -172,7 +172,7 @@ class Beam:
 
 @final
 class Start:
-    """Where another fit begins, which takes it."""
+    """Initial state of a fit, which consumes it."""
 
 @final
 class Fit:

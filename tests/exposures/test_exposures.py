@@ -135,7 +135,7 @@ def test_a_start_at_the_solution_saves_passes_and_keeps_the_answer():
         assert warm.sweeps[-1] < 0.8 * cold.sweeps[-1]
         # Each is within the tolerance of the minimum, as estimated: three times for the estimate.
         np.testing.assert_allclose(warm.sensitivity, cold.sensitivity, rtol=3 * 2 * 1e-6)
-        with pytest.raises(InputError, match="'start' was taken by another fit"):
+        with pytest.raises(InputError, match="'start' was taken by an earlier fit"):
             exposures.fit(options, start)
 
 

@@ -37,6 +37,38 @@ def test_a_unit_that_rounds_nothing_changes_no_bit(raw, unit):
     assert scaled.reduced_chi2 == plain.reduced_chi2
 
 
+@pytest.mark.filterwarnings("ignore::equipix.errors.IdentifiabilityWarning")
+@pytest.mark.parametrize("unit", [2.0**-100, 2.0**-10, 2.0**100])
+@pytest.mark.parametrize(
+    "sought",
+    [
+        {},
+        {"shift_std": 0.05},
+        {"shift_std": 0.05, "rotation": [0, 0, 0, 0, 90]},
+        {"dark": "fit", "flux": [1, 2, 3, 1, 2]},
+        {"flux": "fit"},
+    ],
+)
+def test_a_unit_that_rounds_nothing_changes_no_bit_between_pixels(sought, unit):
+    """Single precision, in which steps are, has no numbers of any size: they are in units."""
+    rng = np.random.default_rng(3)
+    truth = simulate.paper_sensitivity((40, 50), rng=rng)
+    shifts = CROSS + rng.uniform(-0.4, 0.4, CROSS.shape)
+    beam = simulate.wavy_beam(truth.shape, rng=3)
+    frames = simulate.exposures(truth, beam, shifts, rotation=sought.get("rotation"))
+    if "dark" in sought:
+        frames *= np.array(sought["flux"])[:, None, None]
+    frames += 1e-3 * rng.standard_normal(frames.shape)
+    plain, scaled = (
+        equipix.calibrate(
+            u * frames, shifts, variance=np.full(frames.shape, (1e-3 * u) ** 2), **sought
+        )
+        for u in (1, unit)
+    )
+    np.testing.assert_array_equal(scaled.sensitivity, plain.sensitivity)
+    assert scaled.reduced_chi2 == plain.reduced_chi2
+
+
 @pytest.mark.parametrize("unit", [1e-3, 0.1, 1e3])
 def test_the_unit_of_the_frames_plays_no_part(raw, unit):
     options = {"max_sweeps": 15, "tolerance": 1e-9}

@@ -298,9 +298,9 @@ fn lost_measurements_that_are_not_of_the_exposures_are_refused() {
         error_map(&experiment, &answer, 1).err().unwrap().to_string()
     };
     let words = error_with(vec![Vec::new(); 4]);
-    assert_eq!(words, "'start' has lost measurements of 4 exposures, expected 5");
+    assert_eq!(words, "'solution' has lost measurements of 4 exposures, expected 5");
     let words = error_with([vec![vec![PIXELS - 1]; 4], vec![vec![PIXELS]]].concat());
-    assert_eq!(words, "'start' has lost pixel 640, expected 0 to 639");
+    assert_eq!(words, "'solution' has lost pixel 640, expected 0 to 639");
 }
 
 #[test]

@@ -79,7 +79,7 @@ impl Case {
     }
 
     fn fit(&self, frames: &[f64], variance: &[f64], options: &Options, start: Option<&Fit>) -> Fit {
-        let start = start.map(Fit::start);
+        let start = start.map(|start| start.start().unwrap());
         self.with(frames, variance, |exposures, workers, control| {
             calibrate(exposures, options, start, workers, control)
         })
@@ -229,7 +229,7 @@ fn a_start_of_another_sensor_is_refused() {
     let mut start = case.fit(&frames, &variance, &TO, None);
     start.sensitivity.pop();
     let refused = case.with(&frames, &variance, |exposures, workers, control| {
-        Ok(calibrate(exposures, &TO, Some(start.start()), workers, control).unwrap_err())
+        Ok(calibrate(exposures, &TO, Some(start.start()?), workers, control).unwrap_err())
     });
     assert!(refused.to_string().starts_with("'start' has shape 5 exposures of 1007 pixels"));
 }

@@ -264,7 +264,7 @@ class Exposures(Measured):
         return plain.part(self.middle(side))
 
     def fit(self, options: FitOptions, start: Start | None = None) -> Fit:
-        """Fit sensitivity, beam and the other unknowns, from `start` on, which it takes.
+        """Fit sensitivity, beam and the other unknowns, from `start` on, which it consumes.
 
         Raises
         ------

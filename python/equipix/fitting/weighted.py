@@ -169,10 +169,9 @@ def weighted_fit(exposures: Exposures, options: Options, start: Start | None = N
         del nearest, at_medians, variances, signals, fit
         if not options.robust:
             middle = None
-    fit = exposures.fit(options.fit, start)
     if options.robust:
-        return _robust_fit(exposures, options.fit, fit, middle)
-    return Weighted(exposures, fit, None)
+        return _robust_fit(exposures, options.fit, exposures.fit(options.fit, start), middle)
+    return Weighted(exposures, exposures.fit(options.fit, start), None)
 
 
 def _robust_fit(

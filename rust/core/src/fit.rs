@@ -11,6 +11,7 @@ use crate::exposures::Exposures;
 use crate::frames::{Real, Shape};
 use crate::geometry::Rotation;
 use crate::information;
+use crate::memory;
 use crate::parallel::Workers;
 
 /// What became of shifts that were to be refined.
@@ -88,9 +89,11 @@ pub struct Fit {
 }
 
 impl Fit {
-    /// Where another fit may begin: at this one.
-    #[must_use]
-    pub fn start(&self) -> Start {
+    /// The initial state of another fit: this one.
+    ///
+    /// # Errors
+    /// As [`Solution::start`].
+    pub fn start(&self) -> Result<Start> {
         self.solution().start()
     }
 
@@ -165,7 +168,7 @@ impl Fit {
     }
 }
 
-/// Where another fit begins, which gives it up once it has.
+/// The initial state of a fit, which consumes it.
 #[derive(Clone, Debug)]
 pub struct Start {
     pub(crate) sensitivity: Vec<f64>,
@@ -178,8 +181,14 @@ pub struct Start {
 impl Start {
     /// Checks that it is of as many exposures of the same sensor.
     pub(crate) fn check<T: Real>(&self, exposures: &Exposures<'_, T>) -> Result<()> {
-        let of = [self.flux.len(), self.shifts.len()];
-        check_sizes(of, &[self.sensitivity.len()], exposures)
+        let counts = [self.flux.len(), self.shifts.len()];
+        check_sizes("start", counts, &[self.sensitivity.len()], exposures)
+    }
+
+    /// The bytes that it holds.
+    pub(crate) fn bytes(&self) -> u64 {
+        let cells = self.beam.values.len() + self.beam.coefficients.as_ref().map_or(0, Vec::len);
+        8 * (self.sensitivity.len() + cells) as u64
     }
 }
 
@@ -209,22 +218,26 @@ pub struct Solution<'s> {
 }
 
 impl Solution<'_> {
-    /// Where another fit may begin: at this one.
-    #[must_use]
-    pub fn start(&self) -> Start {
-        Start {
+    /// The initial state of another fit: this one.
+    ///
+    /// # Errors
+    /// [`Error::Memory`] if the memory for it cannot be had.
+    pub fn start(&self) -> Result<Start> {
+        // M, and values and coefficients of a beam that is hardly larger.
+        memory::check(24 * self.sensitivity.len() as u64, || "the start of another fit".into())?;
+        Ok(Start {
             sensitivity: self.sensitivity.to_vec(),
             beam: self.beam.copied(),
             flux: self.flux.to_vec(),
             shifts: self.shifts.to_vec(),
             refinement: self.refinement,
-        }
+        })
     }
 
     /// Checks that it is one of as many exposures of the same sensor, and what it lost too.
     pub(crate) fn check<T: Real>(&self, exposures: &Exposures<'_, T>) -> Result<()> {
-        let of = [self.flux.len(), self.shifts.len()];
-        check_sizes(of, &[self.sensitivity.len(), self.flags.len()], exposures)?;
+        let counts = [self.flux.len(), self.shifts.len()];
+        check_sizes("solution", counts, &[self.sensitivity.len(), self.flags.len()], exposures)?;
         self.check_lost(exposures.count(), exposures.sensor().len())
     }
 
@@ -232,13 +245,13 @@ impl Solution<'_> {
         let of = self.lost.len();
         if of != 0 && of != count {
             let problem = format!("has lost measurements of {of} exposures, expected {count}");
-            return Err(Error::value("start", problem));
+            return Err(Error::value("solution", problem));
         }
         match self.lost.iter().copied().flatten().find(|&&pixel| pixel >= pixels) {
             None => Ok(()),
             Some(pixel) => {
                 let problem = format!("has lost pixel {pixel}, expected 0 to {}", pixels - 1);
-                Err(Error::value("start", problem))
+                Err(Error::value("solution", problem))
             }
         }
     }
@@ -293,19 +306,20 @@ impl Solution<'_> {
     }
 }
 
-/// Checks that arrays `of` exposures and of `pixels` have the lengths of those of these exposures.
+/// Checks that an argument has arrays of as many exposures, and of as many pixels, as there are.
 fn check_sizes<T: Real>(
-    of: [usize; 2],
+    argument: &'static str,
+    counts: [usize; 2],
     pixels: &[usize],
     exposures: &Exposures<'_, T>,
 ) -> Result<()> {
     let (count, wanted) = (exposures.count(), exposures.sensor().len());
-    if of.iter().all(|&of| of == count) && pixels.iter().all(|&pixels| pixels == wanted) {
+    if counts.iter().all(|&own| own == count) && pixels.iter().all(|&own| own == wanted) {
         return Ok(());
     }
     Err(Error::Shape {
-        argument: "start",
-        got: format!("{} exposures of {} pixels", of[0], pixels[0]),
+        argument,
+        got: format!("{} exposures of {} pixels", counts[0], pixels[0]),
         wanted: format!("{count} exposures of {wanted} pixels"),
     })
 }

@@ -7,8 +7,8 @@
 //!
 //! L is a spline of coefficients a where shifts are no whole numbers (`layout.rs`), so its part of the
 //! normal matrix is banded while that of M stays diagonal. Hence M is eliminated, not L as in `reduced`,
-//! and Gauss-Newton steps are taken in (a, ln c, d) (`system.rs`), by conjugate gradients in double
-//! precision (`conjugate_gradients.rs`) with a preconditioner on two scales (`preconditioner.rs`). The penalty
+//! and Gauss-Newton steps are taken in (a, ln c, d) (`system.rs`), by conjugate gradients
+//! (`conjugate_gradients.rs`) with a preconditioner on two scales (`preconditioner.rs`). The penalty
 //! (`penalty.rs`) is slight: τ is 1e-5 of the mean weight of a cell. A product is one pass over the
 //! pixels (`pass.rs`).
 

@@ -102,7 +102,7 @@
 //! assert!(map.std.iter().all(|std| (4e-4..2e-2).contains(std)) && halves < 2e-2);
 //!
 //! // A later fit may start from it, and the light is that of the spline that was fitted.
-//! let again = calibrate(&exposures, &Options::default(), Some(fit.start()), &workers, &control)?;
+//! let again = calibrate(&exposures, &Options::default(), Some(fit.start()?), &workers, &control)?;
 //! assert!(again.history.last().sweep < fit.history.last().sweep);
 //! let light = fit.beam.light([0.5, 3.25], Rotation::None, sensor, &workers);
 //! assert!((light[0] / beam(0.5, 3.25) - light[17] / beam(1.5, 4.25)).abs() < 1e-2);

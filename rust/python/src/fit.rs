@@ -6,7 +6,7 @@
 //! |---|---|---|---|
 //! | values, coefficients | float64, 2 | `Beam<&[f64]>` | view |
 //! | functionals, dark_variance | float64, 3 and 2 | `&[f64]` | view |
-//! | sensitivity, flags | float64 and uint32, 2 | `&[f64]`, `&[u32]` | view |
+//! | sensitivity, flags | float64 and uint32, 2 | `&[f64]`, `&[u32]` | view; copied into a start |
 //! | lost, an array for each exposure | uintp, 1 | `Vec<&[usize]>` | view |
 
 use std::num::NonZeroUsize;
@@ -158,9 +158,12 @@ impl PyFit {
         weights.map(|weights| image(py, weights, self.data.checked.sensor())).transpose()
     }
 
-    /// Where another fit may begin: at this one.
+    /// The initial state of another fit: this one.
     fn start(&self, py: Python<'_>) -> PyResult<PyStart> {
-        Ok(PyStart(Mutex::new(Some(self.borrow(py).solution()?.start()))))
+        let borrowed = self.borrow(py);
+        let solution = borrowed.solution()?;
+        let start = run::interruptible(py, None, |_| solution.start())?;
+        Ok(PyStart(Mutex::new(Some(start))))
     }
 
     /// What became of shifts that were to be refined.
@@ -294,7 +297,7 @@ impl PyFit {
     }
 }
 
-/// Where another fit begins, which takes it.
+/// The initial state of a fit, which consumes it.
 #[pyclass(frozen, module = "equipix._native", name = "Start")]
 pub(crate) struct PyStart(Mutex<Option<Start>>);
 
@@ -303,7 +306,7 @@ impl PyStart {
         let taken = self.0.lock().unwrap_or_else(PoisonError::into_inner).take();
         taken.ok_or_else(|| Error::Value {
             argument: "start",
-            problem: "was taken by another fit: ask the fit for one more".into(),
+            problem: "was taken by an earlier fit: call start() of its fit again".into(),
         })
     }
 }

@@ -1,7 +1,7 @@
 //! Conjugate gradients for the joint problem S x = b, its vectors in single or double precision.
 //!
-//! x is in single precision in either case: its rounding is a share of the step that it is, and the next one
-//! begins from what it leaves.
+//! x is in single precision in either case. Its rounding is a share 6e-8 of it: another step makes that good, and
+//! error bars need a share 1e-4.
 
 use super::preconditioner::Preconditioner;
 use super::system::{Precision, System};
@@ -112,7 +112,7 @@ impl<N: Precision> ConjugateGradients<N> {
         let cells = system.state.beam.len();
         let ([of_own, _], [of_x, _]) = (system.units::<N>(), system.units::<f32>());
         let (of_cells, of_others) = self.direction.split_at(cells);
-        workers.add_multiple(&mut self.x[..cells], step * of_own / of_x, of_cells);
+        workers.add_multiple(&mut self.x[..cells], step * (of_own / of_x), of_cells);
         workers.add_multiple(&mut self.x[cells..], step, of_others);
         control.check()?;
         workers.add_multiple(&mut self.residual, -step, &self.product);

@@ -108,7 +108,7 @@ impl<T: Real> System<'_, '_, T> {
     /// Σ W (Δr a)(Δr a)ᵀ/6 over places `step` apart, and how many cells that took.
     fn second_differences(
         &self,
-        slopes: &[Vec<f64>; 2],
+        slopes: &[Vec<f32>; 2],
         step: usize,
         [rows, cols]: [usize; 2],
     ) -> [[f64; 3]; 2] {
@@ -123,7 +123,7 @@ impl<T: Real> System<'_, '_, T> {
             for cell in row * cols..row * cols + last {
                 let places = [cell, cell + step, cell + 2 * step];
                 let [r, c] = slopes.each_ref().map(|slopes| {
-                    let [first, middle, last] = places.map(|place| slopes[place]);
+                    let [first, middle, last] = places.map(|place| f64::from(slopes[place]));
                     first - 2.0 * middle + last
                 });
                 if r.is_finite() && c.is_finite() {
@@ -146,12 +146,12 @@ impl<T: Real> System<'_, '_, T> {
     }
 
     /// The smoothed slopes of ln a along rows and columns, NaN where they are not known.
-    fn relative_slopes(&self) -> [Vec<f64>; 2] {
+    fn relative_slopes(&self) -> [Vec<f32>; 2] {
         let Shape { rows, cols } = self.pass.grid.geometry.beam;
         let beam = &self.state.beam;
         let seen = |cell: usize| self.weights[cell] > 0.0 && beam[cell] > 0.0;
         [(cols, rows), (1, cols)].map(|(step, length)| {
-            let mut found = vec![f64::NAN; beam.len()];
+            let mut found = vec![f32::NAN; beam.len()];
             self.pass.workers.map_blocks(&mut found, cols, |row, found| {
                 for (col, found) in found.iter_mut().enumerate() {
                     let place = if step == 1 { col } else { row };
@@ -166,7 +166,7 @@ impl<T: Real> System<'_, '_, T> {
                             let at = cell + i * step - 2 * step;
                             factor * 0.5 * (beam[at + step] - beam[at - step])
                         });
-                        *found = terms.sum::<f64>() / beam[cell];
+                        *found = (terms.sum::<f64>() / beam[cell]) as f32;
                     }
                 }
             });

@@ -266,6 +266,9 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         if !self.is_weighed_anew {
             self.penalty = None;
             self.weigh(control)?;
+            if self.has_single() {
+                self.pass.free_sums();
+            }
         }
         self.whole(control)
     }
@@ -459,8 +462,7 @@ impl<'m, 'a, T: Real> System<'m, 'a, T> {
         self.divided(step, [1.0 / of_cell, 1.0])
     }
 
-    /// How far F falls along a step in the units of single precision, to first order and by halves, in the unit of
-    /// slopes of fluxes and shifts there.
+    /// Half the first-order decrease of F along a step in the units of single precision, divided by w₀ l₀².
     pub(crate) fn fall(&self, step: &[f32], slope: &[f64]) -> f64 {
         let (workers, cells, [_, of_cell]) =
             (self.pass.workers, self.state.beam.len(), self.units::<f32>());

@@ -32,7 +32,7 @@ impl Course {
         workers: &Workers,
     ) -> Self {
         let fall = workers.dot(step, &slope);
-        if let Some(last) = last.filter(|last| last.slope.len() == slope.len()) {
+        if let Some(last) = last {
             let keep = (fall - workers.dot(step, &last.slope)) / last.fall;
             // More than all of it would be no correction.
             if keep > 0.0 && keep < 1.0 {

@@ -27,8 +27,8 @@ const MOST_PRODUCTS: u64 = 5000;
 const BEFORE_SHIFTS: f64 = 1e-3;
 /// How much of the tolerance a search aims at; the rest is for what linearising adds.
 const AIM: f64 = 0.5;
-/// What linearising adds counts as this share of a step at most, and at least.
-const CURVED: [f64; 2] = [1e-8, 0.03];
+/// What linearising adds counts as this share of a step at most, and at least: a step is in single precision.
+const CURVED: [f64; 2] = [f32::EPSILON as f64, 0.03];
 /// What a step leaves of the error where shifts are sought, whose second derivatives the linear problem does
 /// not know.
 const BY_SHIFTS: f64 = 0.1;
@@ -61,7 +61,9 @@ pub(super) fn minimise<T: Real>(
     workers: &Workers,
     control: &Control,
 ) -> Result<Found> {
-    memory::check(joint::bytes_needed(exposures)?, || {
+    // It gives way to what takes most.
+    let of_start = start.as_ref().map_or(0, Start::bytes);
+    memory::check(joint::bytes_needed(exposures)?.saturating_sub(of_start), || {
         format!("fitting {} exposures of {} jointly", exposures.count(), exposures.sensor())
     })?;
     let mut steps = Steps::new(exposures, options, start, workers, control)?;
