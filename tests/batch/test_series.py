@@ -344,17 +344,20 @@ def test_what_cannot_be_a_recording_is_refused(tmp_path, correction):
 
 
 @pytest.mark.long
-def test_commands(tmp_path, correction, cluster, run):
+def test_commands(tmp_path, correction, cluster, run, monkeypatch):
     at = ("--scheduler", cluster.scheduler_address)
     names = tiffs(tmp_path, frames_of("uint16"))
+    # Names count from the folder of the command, not from that of the workers.
+    monkeypatch.chdir(tmp_path)
+    names, correction = ([os.path.relpath(each) for each in of] for of in (names, [correction]))
     for name, more in (("one", ()), ("two", at)):
-        status, _, err = run("average", *names, "-o", tmp_path / f"{name}.npz", *more)
+        status, _, err = run("average", *names, "-o", f"{name}.npz", *more)
         assert status == 0, err
     one, two = (equipix.load(tmp_path / f"{name}.npz") for name in ("one", "two"))
     agree(one, two)
     assert one.metadata["inputs"] == two.metadata["inputs"]
     assert not (tmp_path / "two.npz.parts").exists()
-    status, out, err = run("correct", correction, *names, "-o", tmp_path / "o.zarr", *at, "--json")
+    status, out, err = run("correct", *correction, *names, "-o", "o.zarr", *at, "--json")
     assert status == 0, err
     assert json.loads(out)["frames"] == COUNT
     shutil.rmtree(tmp_path / "o.zarr")

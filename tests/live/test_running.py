@@ -231,6 +231,15 @@ def test_positions_count_from_any_origin_and_a_taken_one_is_not_advised() -> Non
         running.needed((1, 0))
 
 
+def test_the_position_lies_within_the_travel_even_where_others_do_not() -> None:
+    dark, frames = frames_of(SHAPE, SHIFTS[:5])
+    running = running_of(dark, frames, SHIFTS[:5])
+    assert max(running.needed((5, 3)).position) <= 5
+    assert running.needed((5, 3)).position[1] <= 3
+    with pytest.raises(InputError, match="all positions within it are taken"):
+        running.needed(0)
+
+
 def test_a_frame_that_does_not_fit_changes_nothing() -> None:
     dark, frames = frames_of(SHAPE, SHIFTS)
     running = running_of(dark, frames, SHIFTS)
@@ -240,6 +249,7 @@ def test_a_frame_that_does_not_fit_changes_nothing() -> None:
         (frames[0][0].astype(np.uint8), (0, 0), "dtype"),
         (frames[0][0], (0, np.nan), "finite"),
         (frames[0][0], (0, 0, 0), "row and column"),
+        (np.full(SHAPE, np.nan, np.float32), (0, 0), "no finite number"),
         (np.zeros((0, *SHAPE), np.uint16), (0, 0), "shape"),
     ):
         with pytest.raises(InputError, match=words):

@@ -16,6 +16,7 @@ import pytest
 import tifffile
 
 import equipix
+from equipix.cli.watch import _in_words, _shown
 from equipix.errors import FileError
 from equipix.io import arrivals
 from equipix.live.folder import WatchedFolder
@@ -224,6 +225,22 @@ def test_a_killed_process_goes_on_and_ends_where_the_accuracy_is_met(tmp_path: P
     assert (last["met"], last["next"]) == (True, None)
     assert last["rms"] <= 6e-3
     assert last["positions"][1] == {"exposure": "p1", "shift": [0.0, 11.0]}
+
+
+def test_the_dark_is_waited_for(tmp_path: Path) -> None:
+    found = watched(tmp_path)
+    all_frames(tmp_path)
+    for file in tmp_path.glob("dark-*.tif"):
+        file.unlink()
+    found.look()
+    assert found.running is not None
+    shown, met = _shown(found, found.running, 1.0, None)
+    assert (shown["dark"], met) == (False, False)
+    assert "no frame of the dark yet" in _in_words(shown)
+    all_frames(tmp_path)
+    found.look()
+    shown, met = _shown(found, found.running, 1.0, None)
+    assert (shown["dark"], met) == (True, True)
 
 
 @pytest.mark.long

@@ -164,7 +164,8 @@ def scheduler_at(
         return
     processors, free = len(os.sched_getaffinity(0)), _free_memory()
     fitting = [each for each in memory if each <= free] or [free]
-    count = workers or max(1, min(processors, len(memory), free // max(fitting)))
+    most = workers or min(processors, free // max(fitting))
+    count = max(1, min(most, len(memory)))
     distributed = _distributed()
     import dask
 

@@ -171,9 +171,9 @@ def correct(
             if isinstance(of_dark, str | None)
             else series.kept_array(f"{key}.dark", of_dark)
         )
-        array = ZarrFrames(series.work / f"{key}.zarr")
+        array, at = ZarrFrames(series.work / f"{key}.zarr"), place.absolute()
         jobs = [
-            _Job(array.path, piece, chunk, place, hashes[place], state, options, place_of_dark)
+            _Job(array.path, piece, chunk, at, hashes[place], state, options, place_of_dark)
             for piece in pieces
         ]
         if not array.exists():

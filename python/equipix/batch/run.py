@@ -93,7 +93,7 @@ def run(
     check_suffix(Path(f"result{suffix}"), SUFFIXES)
     positive_workers(workers)
     wanted = read_limits(None if limits is None else as_path("limits", limits))
-    folder = as_path("output", output)
+    folder = as_path("output", output).absolute()  # workers may run elsewhere
     jobs = [
         Job(name, manifest, folder, suffix, options, wanted, partial)
         for name, manifest in _named([as_path("manifests", each) for each in manifests]).items()

@@ -104,7 +104,7 @@ class Frames:
             end = at + file.header.shape[0]
             for number in range(at // size, -(-end // size)):
                 first, last = max(at, number * size), min(end, (number + 1) * size)
-                parts[number].append((file.path, first - at, last - at))
+                parts[number].append((file.path.absolute(), first - at, last - at))
             at = end
         return [Piece(number * size, tuple(each)) for number, each in enumerate(parts)]
 
@@ -116,6 +116,8 @@ def _format(file: FrameFile) -> str:
 
 class Series:
     """Where the pieces of a series are worked on, and the folder of what is finished.
+
+    What jobs name is absolute: workers may run in another folder.
 
     Parameters
     ----------
@@ -136,7 +138,8 @@ class Series:
         workers: int | None = None,
         progress: Progress | None = None,
     ) -> None:
-        self.work, self._address, self._workers, self._progress = work, address, workers, progress
+        self.work, self._address = work.absolute(), address
+        self._workers, self._progress = workers, progress
         self._states: dict[Path, State | None] = {}
 
     def results(
@@ -211,9 +214,10 @@ class Series:
             if size > _HASHED_AT_ONCE and jobs[-1].files:
                 jobs.append(_Hashed(f"hash {len(jobs)}", []))
                 size = 0
-            jobs[-1].files.append(file)
+            jobs[-1].files.append(file.absolute())
         found = self.results(_digests, jobs, PROCESS, "hashing")
-        return {file: each for name in found for file, each in found[name].items()}
+        digests = {file: each for name in found for file, each in found[name].items()}
+        return {file: digests[file.absolute()] for file in files}
 
 
 class _Hashed(NamedTuple):

@@ -69,13 +69,14 @@ def _shown(
     """Collect what the frames so far determine, and whether that is enough."""
     positions = running.positions.tolist()
     found = running.estimate() if len(positions) > 1 else None
-    met = found is not None and until is not None and found.meets(until)
+    met = found is not None and until is not None and found.meets(until) and running.has_dark
     needed = None if met else running.needed(max_shift)
     names = watched.names
     return {
         "positions": [{"exposure": names.get((r, c), ""), "shift": [r, c]} for r, c in positions],
         **_estimated(found),
         "until": until,
+        "dark": running.has_dark,
         "met": met if until is not None else None,
         "next": None if needed is None else _next(needed),
         "calibration_findings": [] if found is None else [f.kind for f in found.findings],
@@ -134,6 +135,8 @@ def _in_words(shown: dict[str, Any]) -> str:
         ]
     if shown["calibration_findings"]:
         words.append(f"findings: {', '.join(shown['calibration_findings'])}")
+    if not shown["dark"]:
+        words.append("no frame of the dark yet")
     if shown["met"]:
         words.append(f"the accuracy {shown['until']:g} is met")
     if shown["next"] is not None:

@@ -213,6 +213,11 @@ class Running:
         return np.array(self._places, dtype=np.float64).reshape(-1, 2)
 
     @property
+    def has_dark(self) -> bool:
+        """Whether there is a frame without light."""
+        return None in self._sums
+
+    @property
     def _places(self) -> list[tuple[float, float]]:
         return [each for each in self._sums if each is not None]
 
@@ -230,13 +235,15 @@ class Running:
         Raises
         ------
         InputError
-            If shape or dtype are not those of the others, or the position is none. Nothing is added
-            then.
+            If shape or dtype are not those of the others, no number is finite, or the position is
+            none. Nothing is added then.
         """
         frames = as_array("frame", frame, ndim=(2, 3))
         frames = frames[None] if frames.ndim == 2 else frames
         if frames.shape[1:] != self._shape or not len(frames):
-            raise InputError(f"'frame' has shape {frames.shape[1:]}, expected {self._shape}")
+            raise InputError(f"'frame' has shape {np.shape(frame)}, expected {self._shape}")
+        if frames.dtype.kind == "f" and not np.isfinite(frames).any():
+            raise InputError("'frame' holds no finite number: give frames with numbers")
         if self._dtype not in (None, frames.dtype):
             raise InputError(
                 f"'frame' has dtype {frames.dtype}, expected {self._dtype} like the first"
@@ -289,7 +296,8 @@ class Running:
         ----------
         max_shift : int or array_like of two, optional
             Travel of the stage from the smallest position so far, in pixels, along both axes or
-            (row, col). Unless given a tenth of the sensor, or as far as the positions so far.
+            (row, col): the position lies within. Unless given a tenth of the sensor, or as far as
+            the positions so far.
 
         Returns
         -------
@@ -304,7 +312,8 @@ class Running:
         if not self._places:
             raise InputError("there are no frames with light: add frames at a first position")
         positions = self.positions
-        travel = np.ceil(_TRAVEL * np.array(self._shape)) if max_shift is None else max_shift
+        usual = np.maximum(np.ceil(_TRAVEL * np.array(self._shape)), np.ptp(positions, axis=0))
+        travel = usual if max_shift is None else max_shift
         noise, drift = math.nan, 0.0
         with warnings.catch_warnings(), naming_memory("planning"):
             warnings.simplefilter("ignore", EquipixWarning)

@@ -230,7 +230,7 @@ def next_position(
     shifts : ndarray, shape (n, 2)
         Positions (row, col) so far, at least one.
     travel : int or array_like of two
-        Travel of the stage from the smallest position so far, in pixels; at least their span.
+        Travel of the stage from the smallest position so far, in pixels.
     noise, drift : float
         As for `error_budget`.
     cfa : Colours, optional
@@ -246,8 +246,8 @@ def next_position(
     points = np.rint(shifts - shifts[0]).astype(np.int64)
     corner = points.min(axis=0)
     points = points - corner
-    reach = np.maximum(_travel(travel, shape), points.max(axis=0))
-    score = _Score(shape, reach, noise, drift)
+    reach = _travel(travel, shape)
+    score = _Score(shape, np.maximum(reach, points.max(axis=0)), noise, drift)
     every = int(np.prod(reach + 1))
     taken = {tuple(each) for each in points.tolist()}
     # Spread evenly over the travel, always the same.

@@ -105,7 +105,7 @@ def page(parts: list[Part], title: str) -> str:
         "page.html",
         title=title,
         version=__version__,
-        made=f"{record.now():.16} UTC".replace("T", " "),
+        made=f"{record.now():.16}".replace("T", " ") + " UTC",
         verdict="FAIL" if "FAIL" in verdicts else "PASS" if verdicts else "",
         parts=parts,
     )
