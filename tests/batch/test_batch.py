@@ -112,12 +112,14 @@ def test_the_output_counts_from_the_folder_of_the_caller(lot, tmp_path, cluster,
     assert (tmp_path / "here" / found.rows[0].result).exists()
 
 
+@pytest.mark.long
 def test_a_cluster_has_no_more_workers_than_tasks():
     distributed = pytest.importorskip("distributed")
     with scheduler_at(None, [10**8], workers=3) as address, distributed.Client(address) as client:
         assert len(client.scheduler_info(n_workers=-1)["workers"]) == 1
 
 
+@pytest.mark.long
 def test_what_is_the_same_is_kept(lot, tmp_path, cluster):
     first = run(lot, tmp_path, cluster)
     again = run(lot, tmp_path, cluster)
