@@ -74,17 +74,20 @@ def run(name: str, program: list[str]) -> bool:
 
 
 def main(wanted: list[str]) -> int:
-    """Run all targets, or those that are named."""
+    """Run all targets, or those that are named, one that is named twice by two processes."""
     if unknown := set(wanted) - {*COMPILED, *IN_PYTHON}:
         known = ", ".join([*COMPILED, *IN_PYTHON])
         sys.exit(f"{sorted(unknown)[0]} is no target, expected one of {known}")
-    folder = built()
-    targets = {name: [str(folder / name)] for name in COMPILED}
-    readers = str(HERE / "readers.py")
-    targets |= {name: [sys.executable, readers, name] for name in IN_PYTHON}
-    chosen = {name: each for name, each in targets.items() if name in (wanted or targets)}
+    names = wanted or [*COMPILED, *IN_PYTHON]
+    folder = built() if set(names) & set(COMPILED) else HERE
+    programs = [
+        [str(folder / each)]
+        if each in COMPILED
+        else [sys.executable, str(HERE / "readers.py"), each]
+        for each in names
+    ]
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as threads:
-        return int(not all([*threads.map(run, chosen, chosen.values())]))
+        return int(not all([*threads.map(run, names, programs)]))
 
 
 if __name__ == "__main__":

@@ -30,6 +30,8 @@ from studies import taken
 
 TIMES = {"started", "finished", "created", "seconds"}
 
+_RESOURCES = {"equipix-memory": 2e9}
+
 SHIFTS = [(0, 0), (0, 5), (0, 9), (5, 0), (9, 0)]
 
 
@@ -136,6 +138,18 @@ def test_what_is_the_same_is_kept(lot, tmp_path, cluster):
     assert states == ["done", "kept", "done"]
 
 
+@pytest.mark.parametrize("file", ["a.tif", "a.html"])
+def test_a_file_that_was_damaged_is_made_again(tmp_path, file):
+    results = tmp_path / "results"
+    results.mkdir()
+    job = Job("a", write_levels(tmp_path / "a"), results, ".tif", {}, LimitsFile(), False)
+    assert [evaluate(job).status for _ in range(2)] == ["done", "kept"]
+    written = (results / file).read_bytes()
+    for damaged in (written[:-1], b"", bytes([written[0] ^ 1, *written[1:]])):
+        (results / file).write_bytes(damaged)
+        assert [evaluate(job).status for _ in range(2)] == ["done", "kept"]
+
+
 @pytest.mark.long
 def test_one_bad_sensor_does_not_stop_the_others(lot, tmp_path, cluster):
     next((tmp_path / "a" / "experiment" / "dark").iterdir()).unlink()
@@ -230,7 +244,7 @@ def test_a_process_takes_one_sensor_at_a_time_and_none_beyond_its_memory(tmp_pat
         "memory_limit": 0,
         "dashboard_address": "127.0.0.1:0",
     }
-    one["resources"] = {"equipix-memory": 2e9}
+    one["resources"] = _RESOURCES
     with LocalCluster(**one) as cluster:
         tasks = [Task(job, 5 * 10**8) for job in jobs]
         rows = [row for _, row in finished(_nap, tasks, cluster.scheduler_address, None)]
@@ -251,6 +265,28 @@ def test_without_declared_memory_nothing_is_sent(tmp_path):
         pytest.raises(errors.EquipixError, match="--resources equipix-memory=BYTES"),
     ):
         next(finished(_nap, tasks, cluster.scheduler_address, None))
+
+
+def test_where_all_workers_are_gone_a_warning_says_so(tmp_path, monkeypatch):
+    """The lot waits, and is evaluated once another one comes."""
+    from distributed import LocalCluster
+
+    jobs = [Job(f"{k}", tmp_path, tmp_path, ".tif", {}, LimitsFile(), False) for k in range(3)]
+    one = {"processes": False, "dashboard_address": "127.0.0.1:0", "resources": _RESOURCES}
+    with LocalCluster(n_workers=1, threads_per_worker=1, **one) as cluster:
+        given = _nap, [Task(job, 10**9) for job in jobs], cluster.scheduler_address, None
+        found = finished(*given)
+        next(found)
+        monkeypatch.setattr("equipix.batch.cluster._TIMEOUT_S", 1)
+        cluster.scale(0)
+        comes = threading.Timer(5, cluster.scale, [1])
+        comes.start()
+        with pytest.warns(
+            errors.EquipixWarning, match=r"no worker is left, tasks that wait for one: 2"
+        ):
+            rows = [row for _, row in found]
+        comes.join()
+    assert [row.status for row in rows] == ["done"] * 2
 
 
 @pytest.mark.long
@@ -349,8 +385,12 @@ def test_what_cannot_be_a_lot_is_refused(lot, tmp_path, monkeypatch):
         batch.run([lot[0], lot[0]], output)
     with pytest.raises(errors.InputError, match="'toleranz' is no option"):
         batch.run(lot, output, toleranz=1)
-    with pytest.raises(errors.InputError, match=r"\.doc"):
+    with pytest.raises(errors.InputError, match=r"'suffix' is '\.doc'"):
         batch.run(lot, output, suffix=".doc")
+    wrong = {"tolerance": np.nan, "method": "best", "max_sweeps": 0, "flux": "x", "order": 7}
+    for name, value in wrong.items():
+        with pytest.raises(errors.InputError, match=f"'{name}' is "):
+            batch.run(lot, output, **{name: value})
     assert not output.exists()
     monkeypatch.setattr("equipix.batch.cluster._TIMEOUT_S", 1)
     with pytest.raises(errors.EquipixError, match="cannot be reached"):

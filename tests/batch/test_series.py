@@ -225,7 +225,7 @@ def test_a_full_disk_is_told_and_the_rest_done_later(tmp_path):
     code = _LIMITED.format(f"average({names!r}, {str(work)!r}, scheduler=None)")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert ".sums: cannot be written: File too large" in done.stderr
-    assert not list(work.iterdir())
+    assert not work.exists()
     agree(batch.average(names, work, scheduler=None), equipix.average(names))
 
 
@@ -323,7 +323,7 @@ def test_counts_are_those_of_one_process(tmp_path, correction):
     assert found.limited > COUNT
 
 
-def test_what_cannot_be_a_recording_is_refused(tmp_path, correction):
+def test_what_cannot_be_a_recording_is_refused(tmp_path, correction, monkeypatch):
     names, output = zarr(tmp_path, frames_of("uint16", 20)), tmp_path / "out.zarr"
     scene = equipix.scene.LocalMean(SHAPE, data_range=np.dtype("uint16"))
     scene.update(frames_of("uint16", 1)[0])
@@ -336,11 +336,19 @@ def test_what_cannot_be_a_recording_is_refused(tmp_path, correction):
         batch.correct(correction, names, output, scheduler=None, dark=["stored", "stored"])
     with pytest.raises(errors.FileError, match="is one of the inputs"):
         batch.correct(correction, names, names[0], scheduler=None, force=True)
+    with pytest.raises(errors.FileError, match="is named twice"):
+        batch.correct(correction, [*names, *names], output, scheduler=None)
     with pytest.raises(errors.InputError, match="'workers'"):
         batch.average(names, tmp_path / "work", scheduler=None, workers=0)
     output.mkdir()
     with pytest.raises(errors.FileError, match="exists already"):
         batch.correct(correction, names, output, scheduler=None)
+    monkeypatch.setattr("equipix.batch.cluster._TIMEOUT_S", 1)
+    output.rmdir()
+    before = {*tmp_path.iterdir()}
+    with pytest.raises(errors.EquipixError, match="cannot be reached"):
+        batch.correct(correction, names, output, scheduler="tcp://127.0.0.1:9")
+    assert {*tmp_path.iterdir()} == before
 
 
 @pytest.mark.long

@@ -2,12 +2,13 @@
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from threading import Lock
 from typing import Any, NamedTuple, TypeVar
 
-from equipix.errors import EquipixError
+from equipix.errors import EquipixError, EquipixWarning
 
 _Result = TypeVar("_Result")
 
@@ -21,6 +22,10 @@ _ROUNDS = 4
 """Times that jobs are sent, if the scheduler ends meanwhile."""
 
 _TIMEOUT_S = 30
+
+_POLL_S = 0.05
+
+_START = f"start one with 'dask worker ADDRESS --resources {_MEMORY}=BYTES'"
 
 
 class Task(NamedTuple):
@@ -65,8 +70,6 @@ def _round(
     client: Any, work: Callable[[Any, int | None], _Result], tasks: list[Task], largest: int
 ) -> Iterator[tuple[Task, _Result | str]]:
     """Tasks that are finished until the scheduler ends."""
-    from distributed import as_completed
-
     sent: dict[Any, Task] = {}
     for task in tasks:
         if task.memory > largest:
@@ -80,13 +83,31 @@ def _round(
                 _on_worker, work, task.job, pure=False, resources={_MEMORY: task.memory}
             )
             sent[future] = task
-    for future in as_completed(sent):
+    for future in _ended(client, sent):
         if future.status == "finished":
             yield sent[future], future.result()
         elif future.status == "error":
             yield sent[future], _in_words(future.exception())
         else:  # lost with the scheduler; the next round keeps what is written whole
             return
+
+
+def _ended(client: Any, futures: Iterable[Any]) -> Iterator[Any]:
+    """Futures as they end; where all workers are gone it warns, and waits for others."""
+    from distributed import as_completed
+
+    left, asked, gone = as_completed(futures), time.monotonic(), False
+    while not left.is_empty():
+        yield from left.next_batch(block=False)
+        time.sleep(_POLL_S)
+        if time.monotonic() - asked < _TIMEOUT_S:
+            continue
+        asked, warned = time.monotonic(), gone
+        with suppress(OSError):  # without the scheduler the futures end
+            gone = not client.scheduler_info()["workers"]
+        if gone and not warned:
+            words = f"no worker is left, tasks that wait for one: {left.count()}; {_START}"
+            warnings.warn(words, EquipixWarning, stacklevel=2)
 
 
 def _in_words(error: BaseException) -> str:
@@ -103,10 +124,7 @@ def _wait(client: Any) -> None:
     try:
         client.wait_for_workers(1, timeout=_TIMEOUT_S)
     except TimeoutError as error:
-        raise EquipixError(
-            f"no worker came within {_TIMEOUT_S} s: start one with 'dask worker ADDRESS "
-            f"--resources {_MEMORY}=BYTES'"
-        ) from error
+        raise EquipixError(f"no worker came within {_TIMEOUT_S} s: {_START}") from error
 
 
 _ALONE = Lock()
@@ -206,8 +224,5 @@ def _declared(client: Any) -> int:
     declared = [int(each["resources"].get(_MEMORY, 0)) for each in workers]
     if not any(declared):
         # A worker that a nanny starts again has what it was started with, and nothing else.
-        raise EquipixError(
-            f"no worker declares its memory: start each with 'dask worker ADDRESS --resources "
-            f"{_MEMORY}=BYTES', such as {_MEMORY}=16e9"
-        )
+        raise EquipixError(f"no worker declares its memory: {_START}, such as {_MEMORY}=16e9")
     return max(declared)

@@ -20,7 +20,7 @@ from equipix.calibration.result import Calibration, refuse_partial
 from equipix.errors import EquipixError, EquipixWarning, FileError
 from equipix.experiment.camera import CameraExperiment
 from equipix.experiment.experiment import Experiment
-from equipix.experiment.image_files import refuse_changed, sha256_of, state_of
+from equipix.experiment.image_files import digest, refuse_changed, sha256_of, state_of
 from equipix.experiment.level_experiment import LevelExperiment
 from equipix.experiment.manifest import kind_of
 from equipix.findings import Finding, Flag
@@ -38,7 +38,7 @@ _PLACES = 48
 """Most rows and columns of the map of flagged pixels that a row holds; its parts are as square as
 whole pixels allow."""
 
-_FORM = 2
+_FORM = 3
 """Form of a row: a sensor whose row has another one is evaluated again."""
 
 
@@ -83,6 +83,8 @@ class Row(Brief):
         along each axis.
     result, report : str
         Names of the files in the output folder.
+    hashes : dict of str to str
+        SHA-256 of each.
     key : str
         Hash of inputs, options, limits and version.
     seconds : float
@@ -102,6 +104,7 @@ class Row(Brief):
     flagged: dict[str, list[list[float]]] = field(default_factory=dict)
     result: str = ""
     report: str = ""
+    hashes: dict[str, str] = field(default_factory=dict)
     key: str = ""
     seconds: float = 0.0
     host: str = ""
@@ -130,7 +133,7 @@ def evaluate(job: Job, workers: int | None = None) -> Row:
             return before
         found = replace(_evaluated(job, described, workers), key=key, host=row.host)
         refuse_changed(states)
-        found = replace(found, seconds=time.monotonic() - started)
+        found = replace(found, hashes=_hashes(job, found), seconds=time.monotonic() - started)
         _write(job, found)
     except EquipixError as error:
         return replace(row, reason=str(error), seconds=time.monotonic() - started)
@@ -168,13 +171,22 @@ def kept(job: Job, described: Described) -> Row | None:
 
 
 def _kept(job: Job, key: str) -> Row | None:
-    """The row of before, if all that it names is there and of the same key."""
+    """The row of before, if it has the same key, and its files are as they were written."""
     row = _before(job)
     if row is None or row.key != key:
         return None
-    if not all((job.output / name).is_file() for name in (row.result, row.report) if name):
+    try:
+        if _hashes(job, row) != row.hashes:
+            return None
+    except OSError:
         return None
     return replace(row, manifest=str(job.manifest), status="kept")
+
+
+def _hashes(job: Job, row: Row) -> dict[str, str]:
+    """SHA-256 of the files of a row."""
+    names = [name for name in (row.result, row.report) if name]
+    return {name: digest(job.output / name).hex() for name in names}
 
 
 def _before(job: Job) -> Row | None:

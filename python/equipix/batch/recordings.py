@@ -20,6 +20,7 @@ from equipix.batch.series import Frames, Piece, key_of, remove_work, series_at, 
 from equipix.correction.apply import Corrector, output_dtype, usual_treatment
 from equipix.correction.correct_files import (
     MARK,
+    TWICE,
     Corrected,
     as_fast,
     pixels_lost,
@@ -127,6 +128,7 @@ def correct(
     check_suffix(target, ZARR)
     files = find_files(frames)
     place = as_path("correction", correction)
+    refuse_inputs(files, [], TWICE)
     refuse_inputs([target], [*files, place])
     if target.exists() and not force:
         raise FileError(f"{target}: exists already; force=True (--force) replaces it")

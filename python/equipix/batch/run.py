@@ -1,14 +1,15 @@
 """All manifests of a lot, on the workers of a cluster."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import fields
 from inspect import signature
 from itertools import chain
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
-from equipix._check import LOG, Progress, positive_workers
+from equipix._check import LOG, FluxModel, Progress, check_word, positive_workers
 from equipix.batch.cluster import Task, finished
 from equipix.batch.evaluation import Job, Row, described_by, evaluate, kept, refuse_taken
 from equipix.batch.lot import LOT, Lot, refuse_no_parquet
@@ -16,8 +17,10 @@ from equipix.batch.memory import bytes_needed
 from equipix.errors import EquipixError, FileError, InputError
 from equipix.experiment.experiment import Experiment
 from equipix.experiment.level_experiment import LevelExperiment
+from equipix.exposures.exposures import FitOptions
 from equipix.io.formats import SUFFIXES
-from equipix.io.paths import as_path, check_suffix
+from equipix.io.paths import as_path
+from equipix.nuc.order import check_order
 from equipix.report.limits import read_limits
 
 _OPTIONS = set(
@@ -72,7 +75,8 @@ def run(
     Raises
     ------
     InputError
-        If an option is unknown, a manifest is named twice, or `suffix` is no format.
+        If an option is unknown or has a wrong value, a manifest is named twice, or `suffix` is no
+        format.
     FileError
         If `output` or `limits` cannot be used, or `output` holds another sensor of the same name.
     EquipixError
@@ -83,14 +87,16 @@ def run(
     The name of a sensor is the folder of its manifest. Where two would have one name, or one would
     be named ``lot``, all get the name of the file or of folders above too. A worker writes the
     result, then a page, then ``NAME.json``, each whole or not at all. A sensor whose JSON file has
-    the hash of its inputs, options, limits and version is kept as it is: a lot that was interrupted
-    goes on where it was. Nothing but rows travels through the scheduler. A worker takes a sensor
-    when the memory for it is free.
+    the hash of its inputs, options, limits and version, and the hashes of its result and its page,
+    is kept as it is: a lot that was interrupted goes on where it was. Nothing but rows travels
+    through the scheduler. A worker takes a sensor when the memory for it is free. Where all workers
+    are gone for 30 s, an `EquipixWarning` says so, and the lot waits for others.
     """
     if unknown := sorted(set(options) - _OPTIONS):
         known = ", ".join(sorted(_OPTIONS))
         raise InputError(f"'{unknown[0]}' is no option of a manifest, expected one of {known}")
-    check_suffix(Path(f"result{suffix}"), SUFFIXES)
+    _check_options(options)
+    check_word("suffix", suffix, SUFFIXES)
     positive_workers(workers)
     wanted = read_limits(None if limits is None else as_path("limits", limits))
     folder = as_path("output", output).absolute()  # workers may run elsewhere
@@ -109,6 +115,15 @@ def run(
     lot = Lot(tuple(found[job.name] for job in jobs))
     lot.save(folder)
     return lot
+
+
+def _check_options(options: Mapping[str, Any]) -> None:
+    """Refuse, before any sensor is evaluated, what each would refuse."""
+    fit = {each.name: options.get(each.name, each.default) for each in fields(FitOptions)}
+    FitOptions.of(**fit)
+    if options.get("flux") is not None:
+        check_word("flux", options["flux"], get_args(FluxModel))
+    check_order(options.get("order", 1), options.get("by", "offset"))
 
 
 def _named(manifests: list[Path]) -> dict[str, Path]:

@@ -275,12 +275,16 @@ def series_at(
         work.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise FileError(f"'{work}' cannot be the folder of pieces: {error.strerror}") from error
-    if scheduler is None:
-        yield Series(work, None, workers, progress)
-        return
-    address = None if scheduler == LOCAL else scheduler
-    with scheduler_at(address, memory, workers) as found:
-        yield Series(work, found, None, progress)
+    try:
+        if scheduler is None:
+            yield Series(work, None, workers, progress)
+            return
+        address = None if scheduler == LOCAL else scheduler
+        with scheduler_at(address, memory, workers) as found:
+            yield Series(work, found, None, progress)
+    finally:
+        with suppress(OSError):  # where there are pieces it is not empty
+            work.rmdir()
 
 
 def key_of(hashes: Mapping[Path, str], **known: object) -> str:

@@ -33,6 +33,9 @@ MARK = "corrected by equipix"
 """Beginning of the description of what `correct_files` writes, so that a second correction is
 detected."""
 
+TWICE = "is named twice: name each input once"
+"""What is wrong with a file that is named twice."""
+
 
 class Corrected(NamedTuple):
     """What was written.
@@ -364,7 +367,7 @@ def is_folder(output: Path) -> bool:
 
 def _outputs(output: Path, files: list[Path], display: Display | None) -> dict[Path, list[Path]]:
     """Name what will be written, each with its inputs."""
-    refuse_inputs(files, [], "is named twice: name each input once")
+    refuse_inputs(files, [], TWICE)
     if not is_folder(output):
         outputs = {output: files}
     else:
