@@ -289,6 +289,43 @@ def test_where_all_workers_are_gone_a_warning_says_so(tmp_path, monkeypatch):
     assert [row.status for row in rows] == ["done"] * 2
 
 
+_ASLEEP = """
+import time
+from typing import NamedTuple
+from equipix.batch.cluster import Task, finished
+
+class Job(NamedTuple):
+    name: str
+
+def asleep(job, workers):
+    print("works", flush=True)
+    time.sleep(60)
+
+if __name__ == "__main__":
+    print("starts", flush=True)
+    [*finished(asleep, [Task(Job("a"), 10**8)], None, 1)]
+"""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("line", [1, 2])
+def test_ctrl_c_ends_workers_of_this_machine_without_a_word_of_theirs(tmp_path, line):
+    """A terminal sends it to all processes, while they start or work."""
+    (tmp_path / "asleep.py").write_text(_ASLEEP)
+    command = [sys.executable, tmp_path / "asleep.py"]
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, **options, start_new_session=True) as process:
+        for _ in range(line):
+            process.stdout.readline()
+        time.sleep(0.5)
+        os.killpg(process.pid, signal.SIGINT)
+        _, err = process.communicate(timeout=30)
+    assert process.returncode == -signal.SIGINT
+    assert err.startswith("Traceback")
+    assert err.count("Traceback") == 1, err
+    assert err.endswith("\nKeyboardInterrupt\n")
+
+
 @pytest.mark.long
 def test_where_all_is_kept_no_cluster_starts(lot, tmp_path, monkeypatch):
     first = batch.run(lot[2:], tmp_path / "results")

@@ -1,10 +1,12 @@
 """Tasks on the workers of dask.distributed, each when the memory for it is free."""
 
-import os
+import logging
+import signal
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from multiprocessing import resource_tracker
 from threading import Lock
 from typing import Any, NamedTuple, TypeVar
 
@@ -180,25 +182,37 @@ def scheduler_at(
     if scheduler is not None:
         yield scheduler
         return
-    processors, free = len(os.sched_getaffinity(0)), _free_memory()
-    fitting = [each for each in memory if each <= free] or [free]
-    most = workers or min(processors, free // max(fitting))
-    count = max(1, min(most, len(memory)))
     distributed = _distributed()
     import dask
 
-    with (
-        dask.config.set(SETTINGS),
-        distributed.LocalCluster(
-            n_workers=count,
-            threads_per_worker=max(1, processors // count),
-            processes=True,
-            memory_limit=0,
-            dashboard_address="127.0.0.1:0",
-            resources={_MEMORY: free // count},
-        ) as cluster,
-    ):
-        yield cluster.scheduler_address
+    processors, free = dask.system.CPU_COUNT, _free_memory()
+    fitting = [each for each in memory if each <= free] or [free]
+    most = workers or min(processors, free // max(fitting))
+    count = max(1, min(most, len(memory)))
+    with dask.config.set(SETTINGS):
+        with _deaf_to_ctrl_c():
+            cluster = distributed.LocalCluster(
+                n_workers=count,
+                threads_per_worker=max(1, processors // count),
+                processes=True,
+                memory_limit=0,
+                dashboard_address="127.0.0.1:0",
+                silence_logs=logging.CRITICAL,  # what ends by Ctrl-C is no news
+                resources={_MEMORY: free // count},
+            )
+        with cluster:
+            yield cluster.scheduler_address
+
+
+@contextmanager
+def _deaf_to_ctrl_c() -> Iterator[None]:
+    """What starts here gets no SIGINT: it is for the caller, who ends all that has started."""
+    resource_tracker.ensure_running()  # would take the signal off the mask
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 def _free_memory() -> int:
