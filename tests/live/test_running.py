@@ -249,6 +249,7 @@ def test_a_frame_that_does_not_fit_changes_nothing() -> None:
         (frames[0][0].astype(np.uint8), (0, 0), "dtype"),
         (frames[0][0], (0, np.nan), "finite"),
         (frames[0][0], (0, 0, 0), "row and column"),
+        (frames[0][0], (0, 100), r"'position' is \(0, 100\): its column part"),
         (np.full(SHAPE, np.nan, np.float32), (0, 0), "no finite number"),
         (np.zeros((0, *SHAPE), np.uint16), (0, 0), "shape"),
     ):

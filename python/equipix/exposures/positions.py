@@ -70,7 +70,9 @@ class Positions(ReadOnly):
         turns = as_rotation(rotation, len(places))
         errors = None if std is None else as_shift_std(std, len(places))
         if shape is not None:
-            _check_reach(as_shifts(shifts), turns, shape[1:])
+            for k, (shift, turn) in enumerate(zip(as_shifts(shifts), turns, strict=True)):
+                window = shape[1:] if turn % 180 == 0 else shape[:0:-1]
+                check_reach(f"'shifts' of exposure {k} (from 0)", shift, window)
         return cls(places, turns, errors)
 
     def __len__(self) -> int:
@@ -241,17 +243,15 @@ _LEAST_STEP, _LEAST_WHOLE_STEP = 1.0, 3.0
 """Least step, in pixels, of which all shifts are multiples; pixels are 1 to 25 micrometres wide."""
 
 
-def _check_reach(shifts: Floats, rotation: Array, shape: tuple[int, ...]) -> None:
+def check_reach(name: str, shift: Floats, shape: tuple[int, ...]) -> None:
     """Refuse a shift as large as the sensor, with its value as it was given."""
-    for k, (shift, turn) in enumerate(zip(shifts, rotation, strict=True)):
-        window = shape if turn % 180 == 0 else shape[::-1]
-        for name, part, side in zip(("row", "column"), shift, window, strict=True):
-            if abs(part) >= side:
-                raise InputError(
-                    f"'shifts' of exposure {k} (from 0) is ({shift[0]:.10g}, {shift[1]:.10g}): "
-                    f"its {name} part must be smaller than the sensor, which has {side} there; "
-                    "micrometres become pixels when divided by the pixel pitch"
-                )
+    for axis, part, side in zip(("row", "column"), shift, shape, strict=True):
+        if abs(part) >= side:
+            raise InputError(
+                f"{name} is ({shift[0]:.10g}, {shift[1]:.10g}): its {axis} part must be smaller "
+                f"than the sensor, which has {side} there; micrometres become pixels when divided "
+                "by the pixel pitch"
+            )
 
 
 def micrometre_step(shifts: Floats, shape: tuple[int, int]) -> float | None:

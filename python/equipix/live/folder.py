@@ -13,7 +13,7 @@ import numpy as np
 from equipix.errors import EquipixError, FileError
 from equipix.experiment.described import excluded_pixels
 from equipix.experiment.image_files import State, state_of
-from equipix.experiment.manifest import Manifest, read_manifest
+from equipix.experiment.manifest import Exposure, Manifest, read_manifest
 from equipix.findings import Finding
 from equipix.io.arrivals import wait_for_change
 from equipix.io.frames import stream_frames
@@ -79,7 +79,7 @@ class WatchedFolder:
     def names(self) -> dict[tuple[float, float], str]:
         """Name of each position."""
         exposures = [] if self._manifest is None else self._manifest.exposure
-        return {place_of(each.shift or (0.0, 0.0)): each.name for each in reversed(exposures)}
+        return {_place(each): each.name for each in reversed(exposures)}
 
     def changes(self) -> Iterator[list[Finding]]:
         """Give, whenever frames have arrived and the folder is quiet, which files are not used.
@@ -227,7 +227,7 @@ class WatchedFolder:
         assert manifest.dark is not None
         named: list[tuple[str | list[str], tuple[float, float] | None]]
         named = [(each.frames, None) for each in manifest.dark]
-        named += [(each.frames, place_of(each.shift or (0.0, 0.0))) for each in manifest.exposure]
+        named += [(each.frames, _place(each)) for each in manifest.exposure]
         found: dict[Path, tuple[tuple[float, float] | None, State]] = {}
         for entry, position in named:
             for name in [entry] if isinstance(entry, str) else entry:
@@ -240,6 +240,11 @@ class WatchedFolder:
                     path = file if manifest.layout is None else manifest.layout.behind(file)
                     found[path] = position, state
         return found
+
+
+def _place(exposure: Exposure) -> tuple[float, float]:
+    """Position of an exposure; the origin unless it is given."""
+    return place_of(exposure.shift or (0.0, 0.0))
 
 
 def _existing(name: str, folder: Path) -> list[Path]:

@@ -24,7 +24,7 @@ from equipix.calibration.result import Calibration
 from equipix.errors import EquipixWarning, InputError
 from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.exposures.flux import Flux
-from equipix.exposures.positions import Positions, whole_moves
+from equipix.exposures.positions import Positions, check_reach, whole_moves
 from equipix.findings import Findings, usable
 from equipix.fitting.weighted import Options
 from equipix.measured.average import RunningAverage
@@ -236,7 +236,7 @@ class Running:
         ------
         InputError
             If shape or dtype are not those of the others, no number is finite, or the position is
-            none. Nothing is added then.
+            none, or as far away as the sensor is large. Nothing is added then.
         """
         frames = as_array("frame", frame, ndim=(2, 3))
         frames = frames[None] if frames.ndim == 2 else frames
@@ -249,6 +249,8 @@ class Running:
                 f"'frame' has dtype {frames.dtype}, expected {self._dtype} like the first"
             )
         place = None if position is None else place_of(position)
+        if place is not None:
+            check_reach("'position'", np.array(place), self._shape)
         with naming_memory("averaging"):
             sums = self._sums.get(place)
             if sums is None:
