@@ -185,8 +185,13 @@ impl Start {
         check_sizes("start", counts, &[self.sensitivity.len()], exposures)
     }
 
+    /// What is still to be found of the bytes that a fit needs: a start gives way to what takes most.
+    pub(crate) fn beside(start: Option<&Self>, needed: u64) -> u64 {
+        needed.saturating_sub(start.map_or(0, Self::bytes))
+    }
+
     /// The bytes that it holds.
-    pub(crate) fn bytes(&self) -> u64 {
+    fn bytes(&self) -> u64 {
         let cells = self.beam.values.len() + self.beam.coefficients.as_ref().map_or(0, Vec::len);
         8 * (self.sensitivity.len() + cells) as u64
     }

@@ -64,9 +64,7 @@ fn at_whole_shifts<T: Real>(
     workers: &Workers,
     control: &Control,
 ) -> Result<Found> {
-    // It gives way to what takes most.
-    let of_start = start.as_ref().map_or(0, Start::bytes);
-    memory::check(bytes_needed(exposures).saturating_sub(of_start), || {
+    memory::check(Start::beside(start.as_ref(), bytes_needed(exposures)), || {
         format!("calibrating {} exposures of {}", exposures.count(), exposures.sensor())
     })?;
     let (mut estimate, history, weak, objective) = match options.method {

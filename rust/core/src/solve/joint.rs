@@ -61,9 +61,7 @@ pub(super) fn minimise<T: Real>(
     workers: &Workers,
     control: &Control,
 ) -> Result<Found> {
-    // It gives way to what takes most.
-    let of_start = start.as_ref().map_or(0, Start::bytes);
-    memory::check(joint::bytes_needed(exposures)?.saturating_sub(of_start), || {
+    memory::check(Start::beside(start.as_ref(), joint::bytes_needed(exposures)?), || {
         format!("fitting {} exposures of {} jointly", exposures.count(), exposures.sensor())
     })?;
     let mut steps = Steps::new(exposures, options, start, workers, control)?;
