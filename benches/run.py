@@ -11,6 +11,7 @@ import platform
 import sys
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import applying
 import averaging
@@ -26,7 +27,6 @@ import response
 import subpixel
 import uncertainty
 import watching
-from commands import Row
 from peers import table as peers
 
 import batch
@@ -35,39 +35,52 @@ import experiment
 import scene
 from equipix import simulate
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from commands import Row
+
 HERE = Path(__file__).parent
 SHIFTS = equipix.cross_pattern(11, 19)
 
 
 def main(*, smoke: bool) -> None:
-    """Run all measurements."""
+    """Run all measurements; print each row once it is measured."""
     rates = cargo.bench("rates", smoke=smoke)
-    rows = [rate_row(rate) for rate in rates]
-    rows.append(numpy_row(rates[0], repetitions=1 if smoke else 7))
-    rows += multiscale.rows(smoke=smoke)
-    rows += uncertainty.rows((48, 64), 1) if smoke else uncertainty.rows()
-    rows += subpixel.rows((48, 64), repetitions=1) if smoke else subpixel.rows()
-    rows += experiment.rows((96, 128), frames=2, repetitions=1) if smoke else experiment.rows()
-    small = (((96, 128), 1, 1),)
-    rows += experiment.large_rows(small) if smoke else experiment.large_rows()
-    rows += large.rows((96, 128)) if smoke else large.rows()
-    few = {"travels": (20,), "patterns": 1}
-    rows += patterns.rows((96, 128), **few) if smoke else patterns.rows()
-    rows += planning.rows((96, 128), travel=20) if smoke else planning.rows()
-    rows += levels.rows((96, 128), frames=3) if smoke else levels.rows()
-    rows += reporting.rows((96, 128)) if smoke else reporting.rows()
-    lot = {"shape": (96, 128), "sensors": 2, "frames": 2, "repetitions": 1}
-    rows += batch.rows(**lot) if smoke else batch.rows()
-    rows += watching.rows((96, 128), frames=2, repetitions=1) if smoke else watching.rows()
-    rows += averaging.rows(frames=3, repetitions=1) if smoke else averaging.rows()
-    rows += response.rows(shape=(24, 32), repetitions=1) if smoke else response.rows()
-    rows += scene.rows(shape=(48, 64), frames=3, passes=1) if smoke else scene.rows()
-    rows += applying.rows(shapes=((48, 64), (24, 32)), repetitions=1) if smoke else applying.rows()
-    rows += peers.rows(factors={(48, 64): 1.5}, seconds=0.5) if smoke else peers.rows()
-    table = markdown(rows, rates[0]["threads"])
-    print(table)
+    lines = heading(rates[0]["threads"])
+    print(*lines, sep="\n")
+    for rows in measured(rates, smoke=smoke):
+        found = [f"| {' | '.join(row)} |" for row in rows]
+        print(*found, sep="\n", flush=True)
+        lines += found
     if not smoke:
-        (HERE / "RESULTS.md").write_text(table)
+        (HERE / "RESULTS.md").write_text("\n".join(lines) + "\n")
+
+
+def measured(rates: list[dict[str, float]], *, smoke: bool) -> Iterator[list[Row]]:
+    """Run one measurement after the other."""
+    yield [rate_row(rate) for rate in rates]
+    yield [numpy_row(rates[0], repetitions=1 if smoke else 7)]
+    yield multiscale.rows(smoke=smoke)
+    yield uncertainty.rows((48, 64), 1) if smoke else uncertainty.rows()
+    yield subpixel.rows((48, 64), repetitions=1) if smoke else subpixel.rows()
+    yield experiment.rows((96, 128), frames=2, repetitions=1) if smoke else experiment.rows()
+    small = (((96, 128), 1, 1),)
+    yield experiment.large_rows(small) if smoke else experiment.large_rows()
+    yield large.rows((96, 128)) if smoke else large.rows()
+    few = {"travels": (20,), "patterns": 1}
+    yield patterns.rows((96, 128), **few) if smoke else patterns.rows()
+    yield planning.rows((96, 128), travel=20) if smoke else planning.rows()
+    yield levels.rows((96, 128), frames=3) if smoke else levels.rows()
+    yield reporting.rows((96, 128)) if smoke else reporting.rows()
+    lot = {"shape": (96, 128), "sensors": 2, "frames": 2, "repetitions": 1}
+    yield batch.rows(**lot) if smoke else batch.rows()
+    yield watching.rows((96, 128), frames=2, repetitions=1) if smoke else watching.rows()
+    yield averaging.rows(frames=3, repetitions=1) if smoke else averaging.rows()
+    yield response.rows(shape=(24, 32), repetitions=1) if smoke else response.rows()
+    yield scene.rows(shape=(48, 64), frames=3, passes=1) if smoke else scene.rows()
+    yield applying.rows(shapes=((48, 64), (24, 32)), repetitions=1) if smoke else applying.rows()
+    yield peers.rows(factors={(48, 64): 1.5}, seconds=0.5) if smoke else peers.rows()
 
 
 def rate_row(rate: dict[str, float]) -> Row:
@@ -120,9 +133,9 @@ def numpy_sweep(frames: np.ndarray, sensitivity: np.ndarray) -> np.ndarray:
     return above / below
 
 
-def markdown(rows: list[Row], threads: float) -> str:
-    """Lay the rows out as a table."""
-    lines = [
+def heading(threads: float) -> list[str]:
+    """What stands above the rows."""
+    return [
         "# Measured",
         "",
         f"By `make bench`, equipix {equipix.__version__}, {threads} threads on "
@@ -132,8 +145,6 @@ def markdown(rows: list[Row], threads: float) -> str:
         "| work | wanted | got | how |",
         "|---|---|---|---|",
     ]
-    lines += [f"| {' | '.join(row)} |" for row in rows]
-    return "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":

@@ -74,7 +74,7 @@ def run(name: str, program: list[str]) -> bool:
 
 
 def main(wanted: list[str]) -> int:
-    """Run all targets, or those that are named, one that is named twice by two processes."""
+    """Run all targets, or those that are named; two processes run one that is named twice."""
     if unknown := set(wanted) - {*COMPILED, *IN_PYTHON}:
         known = ", ".join([*COMPILED, *IN_PYTHON])
         sys.exit(f"{sorted(unknown)[0]} is no target, expected one of {known}")

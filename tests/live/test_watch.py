@@ -107,6 +107,24 @@ def test_a_file_of_another_shape_is_not_used_even_if_it_is_the_first(tmp_path: P
     assert counts(found) == (2,) * 6
 
 
+def test_files_at_a_position_beyond_the_sensor_are_refused_once(tmp_path: Path) -> None:
+    found = watched(tmp_path)
+    all_frames(tmp_path)
+    with found.path.open("a") as file:
+        file.write('[[exposure]]\nname = "far"\nframes = "far-*.tif"\nshift = [0, 2450]\n')
+    far = [tmp_path / f"far-{j}.tif" for j in range(2)]
+    for each in far:
+        written(each, FRAMES[0][0])
+    new, _, findings = found.look()
+    words = "'shift' is (0, 2450): its column part must be smaller than the sensor"
+    assert [each.message.partition(", which")[0] for each in findings] == [
+        f"{each}: {words}" for each in far
+    ]
+    assert new
+    assert found.look() == (False, False, [])
+    assert counts(found) == (2,) * 6
+
+
 def test_a_file_that_vanishes_or_changes_no_longer_counts(tmp_path: Path) -> None:
     found = watched(tmp_path)
     all_frames(tmp_path)

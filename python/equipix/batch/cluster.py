@@ -3,14 +3,14 @@
 import logging
 import signal
 import time
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from multiprocessing import resource_tracker
 from threading import Lock
 from typing import Any, NamedTuple, TypeVar
 
-from equipix.errors import EquipixError, EquipixWarning
+from equipix.errors import EquipixError
+from equipix.findings import Finding, say
 
 _Result = TypeVar("_Result")
 
@@ -104,12 +104,14 @@ def _ended(client: Any, futures: Iterable[Any]) -> Iterator[Any]:
         time.sleep(_POLL_S)
         if time.monotonic() - asked < _TIMEOUT_S:
             continue
-        asked, warned = time.monotonic(), gone
-        with suppress(OSError):  # without the scheduler the futures end
-            gone = not client.scheduler_info()["workers"]
-        if gone and not warned:
-            words = f"no worker is left, tasks that wait for one: {left.count()}; {_START}"
-            warnings.warn(words, EquipixWarning, stacklevel=2)
+        asked, before = time.monotonic(), gone
+        try:
+            gone = not client.nthreads()
+        except (OSError, AttributeError):  # the scheduler ended, and so will the futures
+            continue
+        if gone and not before:
+            words = f"there is no worker for {left.count()} tasks, which wait: {_START}"
+            say(Finding("workers", words, "input"))
 
 
 def _in_words(error: BaseException) -> str:
@@ -182,34 +184,35 @@ def scheduler_at(
     if scheduler is not None:
         yield scheduler
         return
-    distributed = _distributed()
+    distributed, free = _distributed(), _free_memory()
     import dask
+    from dask.system import CPU_COUNT
 
-    processors, free = dask.system.CPU_COUNT, _free_memory()
     fitting = [each for each in memory if each <= free] or [free]
-    most = workers or min(processors, free // max(fitting))
+    most = workers or min(CPU_COUNT, free // max(fitting))
     count = max(1, min(most, len(memory)))
-    with dask.config.set(SETTINGS):
-        with _deaf_to_ctrl_c():
+    with dask.config.set(SETTINGS), ExitStack() as stack:
+        with _sigint_blocked():
             cluster = distributed.LocalCluster(
                 n_workers=count,
-                threads_per_worker=max(1, processors // count),
+                threads_per_worker=max(1, CPU_COUNT // count),
                 processes=True,
                 memory_limit=0,
                 dashboard_address="127.0.0.1:0",
-                silence_logs=logging.CRITICAL,  # what ends by Ctrl-C is no news
+                silence_logs=logging.CRITICAL,  # what ends a worker is the reason of its task
                 resources={_MEMORY: free // count},
             )
-        with cluster:
-            yield cluster.scheduler_address
+            stack.enter_context(cluster)
+        yield cluster.scheduler_address
 
 
 @contextmanager
-def _deaf_to_ctrl_c() -> Iterator[None]:
+def _sigint_blocked() -> Iterator[None]:
     """What starts here gets no SIGINT: it is for the caller, who ends all that has started."""
     resource_tracker.ensure_running()  # would take the signal off the mask
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, ())
     try:
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
@@ -234,7 +237,7 @@ def _largest(client: Any, wanted: int) -> int:
 
 def _declared(client: Any) -> int:
     """Bytes of the largest worker that is there."""
-    workers = client.scheduler_info(n_workers=-1)["workers"].values()
+    workers = client.sync(client.scheduler.identity, n_workers=-1)["workers"].values()
     declared = [int(each["resources"].get(_MEMORY, 0)) for each in workers]
     if not any(declared):
         # A worker that a nanny starts again has what it was started with, and nothing else.

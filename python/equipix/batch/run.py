@@ -9,7 +9,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, get_args
 
-from equipix._check import LOG, FluxModel, Progress, check_word, positive_workers
+from equipix._check import LOG, FluxModel, Progress, check_type, check_word, positive_workers
 from equipix.batch.cluster import Task, finished
 from equipix.batch.evaluation import Job, Row, described_by, evaluate, kept, refuse_taken
 from equipix.batch.lot import LOT, Lot, refuse_no_parquet
@@ -90,13 +90,14 @@ def run(
     the hash of its inputs, options, limits and version, and the hashes of its result and its page,
     is kept as it is: a lot that was interrupted goes on where it was. Nothing but rows travels
     through the scheduler. A worker takes a sensor when the memory for it is free. Where all workers
-    are gone for 30 s, an `EquipixWarning` says so, and the lot waits for others.
+    are gone, an `InputWarning` says so within a minute, and the lot waits for others.
     """
     if unknown := sorted(set(options) - _OPTIONS):
         known = ", ".join(sorted(_OPTIONS))
         raise InputError(f"'{unknown[0]}' is no option of a manifest, expected one of {known}")
     _check_options(options)
-    check_word("suffix", suffix, SUFFIXES)
+    check_type("suffix", suffix, str, "a text such as .tif")
+    check_word("suffix", suffix.lower(), SUFFIXES)
     positive_workers(workers)
     wanted = read_limits(None if limits is None else as_path("limits", limits))
     folder = as_path("output", output).absolute()  # workers may run elsewhere
@@ -118,7 +119,7 @@ def run(
 
 
 def _check_options(options: Mapping[str, Any]) -> None:
-    """Refuse, before any sensor is evaluated, what each would refuse."""
+    """Refuse wrong values of options before any sensor is evaluated."""
     fit = {each.name: options.get(each.name, each.default) for each in fields(FitOptions)}
     FitOptions.of(**fit)
     if options.get("flux") is not None:

@@ -271,6 +271,7 @@ def series_at(
     Series
         To be used until the processes end.
     """
+    is_new = not work.exists()
     try:
         work.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -283,8 +284,9 @@ def series_at(
         with scheduler_at(address, memory, workers) as found:
             yield Series(work, found, None, progress)
     finally:
-        with suppress(OSError):  # where there are pieces it is not empty
-            work.rmdir()
+        if is_new:
+            with suppress(OSError):  # where there are pieces it is not empty
+                work.rmdir()
 
 
 def key_of(hashes: Mapping[Path, str], **known: object) -> str:

@@ -14,6 +14,7 @@ from equipix.errors import EquipixError, FileError
 from equipix.experiment.described import excluded_pixels
 from equipix.experiment.image_files import State, state_of
 from equipix.experiment.manifest import Exposure, Manifest, read_manifest
+from equipix.exposures.positions import check_reach
 from equipix.findings import Finding
 from equipix.io.arrivals import wait_for_change
 from equipix.io.frames import stream_frames
@@ -158,14 +159,20 @@ class WatchedFolder:
                 f"{file}: holds {kind[1]} frames of shape {kind[0]}, expected {wanted[1]} of shape "
                 f"{wanted[0]} as most files: use a copy, or take the frames again"
             )
-        if self._running is None:
-            self._running, self._wanted = self._begin(kind[0]), wanted
+        if position is not None:
+            check_reach(f"{file}: 'shift'", np.array(position), kind[0])
+        running, added = self._begin(kind[0]) if self._running is None else self._running, False
         try:
             for _, frames in stream_frames([file]):
-                self._running.add(frames, position)
+                running.add(frames, position)
+                added = True
         except EquipixError:
-            self._forget()  # some may have been added
+            if added:
+                refused = self._refused  # by what they hold
+                self._forget()
+                self._refused = refused
             raise
+        self._running, self._wanted = running, wanted
 
     def _begin(self, shape: tuple[int, ...]) -> Running:
         assert self._manifest is not None

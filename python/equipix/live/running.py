@@ -235,8 +235,9 @@ class Running:
         Raises
         ------
         InputError
-            If shape or dtype are not those of the others, no number is finite, or the position is
-            none, or as far away as the sensor is large. Nothing is added then.
+            If shape or dtype are not those of the others, no number is finite, or `position` is
+            not two finite numbers, each smaller than the sensor along its axis. Nothing is added
+            then.
         """
         frames = as_array("frame", frame, ndim=(2, 3))
         frames = frames[None] if frames.ndim == 2 else frames

@@ -185,8 +185,8 @@ impl Start {
         check_sizes("start", counts, &[self.sensitivity.len()], exposures)
     }
 
-    /// What is still to be found of the bytes that a fit needs: a start gives way to what takes most.
-    pub(crate) fn beside(start: Option<&Self>, needed: u64) -> u64 {
+    /// Bytes that a fit needs beside its start, which gives way to what takes most.
+    pub(crate) fn bytes_beside(start: Option<&Self>, needed: u64) -> u64 {
         needed.saturating_sub(start.map_or(0, Self::bytes))
     }
 

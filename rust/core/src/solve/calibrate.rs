@@ -64,7 +64,7 @@ fn at_whole_shifts<T: Real>(
     workers: &Workers,
     control: &Control,
 ) -> Result<Found> {
-    memory::check(Start::beside(start.as_ref(), bytes_needed(exposures)), || {
+    memory::check(Start::bytes_beside(start.as_ref(), bytes_needed(exposures)), || {
         format!("calibrating {} exposures of {}", exposures.count(), exposures.sensor())
     })?;
     let (mut estimate, history, weak, objective) = match options.method {

@@ -61,7 +61,7 @@ pub(super) fn minimise<T: Real>(
     workers: &Workers,
     control: &Control,
 ) -> Result<Found> {
-    memory::check(Start::beside(start.as_ref(), joint::bytes_needed(exposures)?), || {
+    memory::check(Start::bytes_beside(start.as_ref(), joint::bytes_needed(exposures)?), || {
         format!("fitting {} exposures of {} jointly", exposures.count(), exposures.sensor())
     })?;
     let mut steps = Steps::new(exposures, options, start, workers, control)?;
