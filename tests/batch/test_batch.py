@@ -288,6 +288,23 @@ def test_where_all_workers_are_gone_a_warning_says_so(tmp_path, monkeypatch):
     assert [row.status for row in rows] == ["done"] * 2
 
 
+def _deadly(job, _):
+    if job.name == "deadly":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return Row(job.name, "", status="done")
+
+
+@pytest.mark.long
+def test_who_waits_behind_a_task_that_ends_processes_is_not_blamed():
+    """The largest comes first, and ends each process that works on it."""
+    names = ("deadly", "a", "b", "c")
+    jobs = [Job(name, None, None, ".tif", {}, None, False) for name in names]
+    tasks = [Task(job, 10**8 - number) for number, job in enumerate(jobs)]
+    found = {task.job.name: row for task, row in finished(_deadly, tasks, None, 1)}
+    assert found.pop("deadly").startswith("each process that worked on it ended")
+    assert [row.status for row in found.values()] == ["done"] * 3
+
+
 _ASLEEP = """
 import time
 from typing import NamedTuple

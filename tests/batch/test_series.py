@@ -311,6 +311,39 @@ def test_a_recording_goes_on_where_it_was(tmp_path, correction, monkeypatch):
     assert files_in(tmp_path / "one.zarr") == files_in(output)
 
 
+@pytest.mark.parametrize("damage", ["removed", "emptied", "flipped", "mark"])
+def test_a_piece_that_was_damaged_is_made_again(tmp_path, correction, monkeypatch, damage):
+    names, output = zarr(tmp_path, frames_of("uint16")), tmp_path / "out.zarr"
+    batch.correct(correction, names, tmp_path / "one.zarr", scheduler=None)
+    monkeypatch.setattr(recordings, "_total", lambda _: (_ for _ in ()).throw(errors.FileError))
+    with pytest.raises(errors.FileError):
+        batch.correct(correction, names, output, scheduler=None)
+    monkeypatch.undo()
+    (array,) = (tmp_path / "out.zarr.parts").glob("*.zarr")
+    chunk = array / "c" / "1" / "0" / "0"
+    content = chunk.read_bytes()
+    if damage == "removed":
+        chunk.unlink()
+    elif damage == "mark":
+        (mark,) = array.parent.glob("*.250.json")
+        mark.write_text(mark.read_text().replace('"limited":0', '"limited":7'))
+    else:
+        chunk.write_bytes(b"" if damage == "emptied" else bytes([content[0] ^ 1, *content[1:]]))
+    counts = batch.correct(correction, names, output, scheduler=None)
+    assert counts.limited == 0
+    assert files_in(tmp_path / "one.zarr") == files_in(output)
+
+
+def test_a_recording_that_lacks_a_chunk_is_refused(tmp_path, correction):
+    names = zarr(tmp_path, frames_of("uint16"))
+    (tmp_path / "frames.zarr" / "c" / "3" / "0" / "0").unlink()
+    words = r"frames\.zarr: lacks 1 of 12 chunks, which would be read as 0: copy it again"
+    with pytest.raises(errors.FileError, match=words):
+        batch.correct(correction, names, tmp_path / "out.zarr", scheduler=None)
+    with pytest.raises(errors.FileError, match=words):
+        equipix.average(names)
+
+
 @pytest.mark.filterwarnings("ignore:100% of the corrected values")
 def test_counts_are_those_of_one_process(tmp_path, correction):
     frames = frames_of("uint16")

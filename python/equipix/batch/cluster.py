@@ -3,7 +3,7 @@
 import logging
 import signal
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from multiprocessing import resource_tracker
 from threading import Lock
@@ -72,7 +72,16 @@ def _round(
     client: Any, work: Callable[[Any, int | None], _Result], tasks: list[Task], largest: int
 ) -> Iterator[tuple[Task, _Result | str]]:
     """Tasks that are finished until the scheduler ends."""
+    from distributed import KilledWorker, as_completed
+
     sent: dict[Any, Task] = {}
+
+    def send(task: Task) -> Any:
+        resources = {_MEMORY: task.memory}
+        future = client.submit(_on_worker, work, task.job, pure=False, resources=resources)
+        sent[future] = task
+        return future
+
     for task in tasks:
         if task.memory > largest:
             yield (
@@ -80,25 +89,28 @@ def _round(
                 f"needs {task.memory / 1e9:.1f} GB, and the largest worker has "
                 f"{largest / 1e9:.1f} GB: give a worker more memory, or bin the frames",
             )
-        else:
-            future = client.submit(
-                _on_worker, work, task.job, pure=False, resources={_MEMORY: task.memory}
-            )
-            sent[future] = task
-    for future in _ended(client, sent):
+    left = as_completed([send(task) for task in tasks if task.memory <= largest])
+    suspects: list[Task] = []
+    is_alone = False
+    for future in _ended(client, left):
+        task = sent.pop(future)
         if future.status == "finished":
-            yield sent[future], future.result()
-        elif future.status == "error":
-            yield sent[future], _in_words(future.exception())
-        else:  # lost with the scheduler; the next round keeps what is written whole
-            return
+            yield task, future.result()
+        elif future.status != "error":
+            return  # lost with the scheduler; the next round keeps what is written whole
+        elif isinstance(future.exception(), KilledWorker) and not is_alone:
+            # Dask blames all tasks that wait where a process ends: each is tried alone.
+            suspects.append(task)
+        else:
+            yield task, _in_words(future.exception())
+        if suspects and not sent:
+            is_alone = True
+            left.add(send(suspects.pop()))
 
 
-def _ended(client: Any, futures: Iterable[Any]) -> Iterator[Any]:
+def _ended(client: Any, left: Any) -> Iterator[Any]:
     """Futures as they end; where all workers are gone it warns, and waits for others."""
-    from distributed import as_completed
-
-    left, asked, gone = as_completed(futures), time.monotonic(), False
+    asked, gone = time.monotonic(), False
     while not left.is_empty():
         yield from left.next_batch(block=False)
         time.sleep(_POLL_S)
@@ -119,7 +131,10 @@ def _in_words(error: BaseException) -> str:
     from distributed import KilledWorker
 
     if isinstance(error, KilledWorker):
-        return "the processes that worked on it ended again and again, perhaps for lack of memory"
+        return (
+            "each process that worked on it ended, perhaps for lack of memory: give a worker more "
+            "memory, or bin the frames"
+        )
     return f"the worker ended with {type(error).__name__}: {error}"
 
 

@@ -1,7 +1,6 @@
 """Long recordings corrected: Zarr arrays that workers write by whole chunks."""
 
 import hashlib
-import json
 import math
 import shutil
 from collections import Counter
@@ -34,7 +33,7 @@ from equipix.errors import FileError, InputError
 from equipix.experiment.image_files import origin_of, sha256_of
 from equipix.findings import usable
 from equipix.io.arrays import ZARR, ZarrFrames
-from equipix.io.formats import FrameFile, raw_headers
+from equipix.io.formats import FrameFile, checked, raw_headers, with_checksum
 from equipix.io.frames import stream_part
 from equipix.io.paths import (
     as_path,
@@ -119,9 +118,9 @@ def correct(
     -----
     Each worker writes whole chunks of frames, by any number of workers the same bytes. A piece of
     some 256 frames is kept once it is written: called again after a fault, the function goes on
-    with those of the same inputs, options and version. They are in a folder beside the output,
-    which is moved to its place when all are written. Memory does not grow with the number of
-    frames.
+    with those of the same inputs, options and version whose chunks have the same hash. They are in
+    a folder beside the output, which is moved to its place when all are written. Memory does not
+    grow with the number of frames.
     """
     target = as_path("output", output)
     positive_workers(workers)
@@ -184,8 +183,7 @@ def correct(
             history = [f"dark: {darks.named(files[0])}", f"{bad} flagged pixels: {how}"]
             shape, mark = (given.count, *given.shape), f"{MARK}, {origin}"
             array.create(shape, wanted, chunk, description=mark, history=history)
-        left = [job for job in jobs if job.counts() is None]
-        series.results(_corrected, left, memory[0], "correcting")
+        series.results(_kept_or_corrected, jobs, memory[0], "correcting")
         series.refuse_changed([job.mark for job in jobs])
         counts = _total(jobs)
         array.clean()
@@ -245,23 +243,36 @@ class _Job:
         """The file that says that the piece is written, and what was counted."""
         return self.array.with_suffix(f".{self.piece.start}.json")
 
-    def counts(self) -> dict[str, int] | None:
-        """What was counted, once the piece is written."""
+    @property
+    def sha256(self) -> str:
+        """Hash of the chunks of the piece."""
+        first = self.piece.start
+        return ZarrFrames(self.array).sha256(first, first + self.piece.length)
+
+    def told(self) -> dict[str, Any]:
+        """What the mark says: the hash of the chunks, and what was counted; nothing without one."""
         try:
-            found: dict[str, int] = json.loads(self.mark.read_text())
+            return checked(self.mark.read_text()) or {}
         except (OSError, ValueError):
-            return None
-        return found
+            return {}
+
+    def is_kept(self) -> bool:
+        """Whether the piece is as it was written."""
+        told = self.told()
+        try:
+            return bool(told) and told["sha256"] == self.sha256
+        except OSError:
+            return False
 
 
 def _total(jobs: list[_Job]) -> Counter[str]:
     """What was counted in all."""
     total: Counter[str] = Counter()
     for job in jobs:
-        counts = job.counts()
-        if counts is None:
+        told = job.told()
+        if not told:
             raise FileError(f"{job.mark}: was removed meanwhile: call again")
-        total.update(counts)
+        total.update(told["counts"])
     return total
 
 
@@ -269,6 +280,11 @@ def _total(jobs: list[_Job]) -> Counter[str]:
 def _loaded(path: Path, _hash: str, substrate_c: float | None, bias_v: float | None) -> Correction:
     """Read a correction once in each process, unless the file changes."""
     return load_correction(path, substrate_c=substrate_c, bias_v=bias_v)
+
+
+def _kept_or_corrected(job: _Job, workers: int | None) -> int:
+    """Correct a piece, unless it is as it was written before."""
+    return job.piece.length if job.is_kept() else _corrected(job, workers)
 
 
 def _corrected(job: _Job, workers: int | None) -> int:
@@ -291,7 +307,7 @@ def _corrected(job: _Job, workers: int | None) -> int:
             "not_finite": not_finite,
         }
         with write_whole(job.mark, force=True) as temporary:
-            temporary.write_text(json.dumps(counts))
+            temporary.write_text(with_checksum({"sha256": job.sha256, "counts": counts}))
     return corrector.frames
 
 

@@ -5,6 +5,7 @@ An array is (rows, cols) or (..., rows, cols). In HDF5 and Zarr its place stands
 names as the default.
 """
 
+import hashlib
 import math
 import os
 import re
@@ -62,6 +63,18 @@ def header(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any], str]:
         return (int(np.prod(above)), rows, cols), np.dtype(array.dtype).newbyteorder("="), text
 
 
+def _refuse_missing_chunks(path: Path, array: Any) -> None:
+    """Refuse a Zarr array that lacks files of chunks, which are read as the fill value."""
+    stored = array.shards or array.chunks
+    wanted = math.prod(math.ceil(n / side) for n, side in zip(array.shape, stored, strict=True))
+    there = array.nchunks_initialized * math.prod(array.chunks) // math.prod(stored)
+    if there < wanted:
+        raise FileError(
+            f"{path}: lacks {wanted - there} of {wanted} chunks, which would be read as "
+            f"{array.fill_value}: copy it again, or write it whole (of zarr: write_empty_chunks)"
+        )
+
+
 def stream_frames(path: Path, start: int = 0, stop: int | None = None) -> Iterator[NDArray[Any]]:
     """Frames of a file, some at a time, each part of shape (n, rows, cols); no chunk twice."""
     with _opened(path) as array:
@@ -115,6 +128,8 @@ def _opened(path: Path) -> Iterator[Any]:
     suffix = file.suffix.lower()
     opened = _npy if suffix == ".npy" else _hdf5 if suffix in HDF5 else _zarr
     with opened(file, place) as array:
+        if opened is _zarr:
+            _refuse_missing_chunks(path, array)
         if array.ndim < 2 or 0 in array.shape or np.dtype(array.dtype).kind not in "uif":
             raise FileError(
                 f"{path}: is {array.dtype} of shape {array.shape}, expected numbers of shape "
@@ -222,13 +237,24 @@ class ZarrFrames:
 
     def write(self, start: int, frames: NDArray[Any]) -> None:
         """Write one chunk, or the last frames, and wait until they are on the disk."""
-        array = _zarr_library().open_array(str(self.path), mode="r+")
-        array[start : start + len(frames)] = frames
-        # A chunk that holds nothing but the fill value is not written.
-        chunk = self.path / array.metadata.encode_chunk_key((start // array.chunks[0], 0, 0))
-        if chunk.exists():
-            with chunk.open("rb+") as file:
-                os.fsync(file.fileno())
+        zarr = _zarr_library()
+        # Else a chunk of zeros would be none, as one that was lost.
+        with zarr.config.set({"array.write_empty_chunks": True}):
+            array = zarr.open_array(str(self.path), mode="r+")
+            array[start : start + len(frames)] = frames
+        with self._chunk(array, start).open("rb+") as file:
+            os.fsync(file.fileno())
+
+    def sha256(self, start: int, stop: int) -> str:
+        """Hash of the files of the chunks that hold these frames."""
+        array = _zarr_library().open_array(str(self.path), mode="r")
+        found = hashlib.sha256()
+        for at in range(start, stop, array.chunks[0]):
+            found.update(self._chunk(array, at).read_bytes())
+        return found.hexdigest()
+
+    def _chunk(self, array: Any, start: int) -> Path:
+        return Path(self.path, array.metadata.encode_chunk_key((start // array.chunks[0], 0, 0)))
 
 
 @contextmanager
