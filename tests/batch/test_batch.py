@@ -73,6 +73,9 @@ def test_each_sensor_has_a_result_a_page_and_a_row(lot, tmp_path, cluster):
         written = checked((tmp_path / "results" / f"{row.sensor}.json").read_text())
         assert Row(**written) == row
     columns = found.columns
+    for row, count in zip(found.rows, columns["flagged_pixels.DO_NOT_USE"], strict=True):
+        flags = equipix.load(tmp_path / "results" / row.result).flags
+        assert count == np.count_nonzero(flags & equipix.Flag.DO_NOT_USE)
     with (tmp_path / "results" / "lot.csv").open(newline="") as file:
         rows = [*csv.DictReader(file)]
     assert [row["sensor"] for row in rows] == columns["sensor"]
@@ -449,6 +452,9 @@ def test_what_cannot_be_a_lot_is_refused(lot, tmp_path, monkeypatch):
     monkeypatch.setattr("equipix.batch.cluster._TIMEOUT_S", 1)
     with pytest.raises(errors.EquipixError, match="cannot be reached"):
         batch.run(lot, output, scheduler="tcp://127.0.0.1:9")
+    (output / "lot.html").mkdir(parents=True)
+    with pytest.raises(errors.FileError, match=r"lot\.html: is a folder"):
+        batch.run(lot, output)
 
 
 @pytest.mark.long
@@ -460,6 +466,8 @@ def test_the_command_tells_states_and_reasons(lot, tmp_path, run_command, cluste
     assert status == 1
     assert (told["done"], told["kept"], told["failed"]) == (2, 0, 1)
     assert "1 of 3 sensors gave no result" in err
+    _, out, _ = run_command("batch", *given)
+    assert "a-experiment" in out.partition("why it has no result")[2]
 
 
 @pytest.fixture

@@ -125,6 +125,17 @@ def test_files_at_a_position_beyond_the_sensor_are_refused_once(tmp_path: Path) 
     assert counts(found) == (2,) * 6
 
 
+def test_a_copy_does_not_count_twice(tmp_path: Path) -> None:
+    found = watched(tmp_path)
+    all_frames(tmp_path)
+    written(tmp_path / "p4-9.tif", FRAMES[1][0])
+    written(tmp_path / "dark-9.tif", DARK[0])  # a camera may show 0 in the dark
+    new, _, (finding,) = found.look()
+    assert new
+    assert finding.message.startswith(f"{tmp_path / 'p4-9.tif'}: is a copy of 'p1-0.tif'")
+    assert counts(found) == (2,) * 6
+
+
 def test_a_file_that_vanishes_or_changes_no_longer_counts(tmp_path: Path) -> None:
     found = watched(tmp_path)
     all_frames(tmp_path)

@@ -14,6 +14,9 @@ from equipix.findings import Finding, say
 
 _Result = TypeVar("_Result")
 
+LOCAL = "local"
+"""In the place of a scheduler's address: worker processes on this machine."""
+
 _MEMORY = "equipix-memory"
 """The resource of dask that workers have as many of as bytes."""
 
@@ -159,15 +162,16 @@ def _on_worker(work: Callable[[Any, int | None], _Result], job: Any) -> _Result:
 
 @contextmanager
 def _client(scheduler: str) -> Iterator[Any]:
-    """A client of the scheduler."""
+    """A client of the scheduler; what it would log is the reason of a task, or a warning."""
+    distributed = _distributed()
     try:
-        client = _distributed().Client(scheduler, timeout=f"{_TIMEOUT_S}s")
+        client = distributed.Client(scheduler, timeout=f"{_TIMEOUT_S}s")
     except (OSError, ValueError) as error:
         raise EquipixError(
             f"the scheduler '{scheduler}' cannot be reached ({error}): name it as "
             "tcp://HOST:PORT, and see that it runs"
         ) from error
-    with client:
+    with distributed.utils.silence_logging_cmgr(logging.CRITICAL), client:
         yield client
 
 

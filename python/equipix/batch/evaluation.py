@@ -244,7 +244,10 @@ def _evaluated(job: Job, described: Described, workers: int | None) -> Row:
     part = part_of(job.name, result, job.limits)
     write_page(report, page([part], job.name), force=True)
     size = "{}×{}".format(*result.shape)
-    row = _row(job, part.checks, result.findings, {"size": size, **summary(result)})
+    figures = {"size": size, **summary(result)}
+    # Each table has the same columns, also of flags that no pixel has.
+    figures["flagged_pixels"] = {str(each.name): 0 for each in Flag} | figures["flagged_pixels"]
+    row = _row(job, part.checks, result.findings, figures)
     return replace(row, result=output.name, flagged=_flagged(result.flags))
 
 
@@ -268,12 +271,18 @@ def _row(
     job: Job, checks: list[Check], findings: tuple[Finding, ...], figures: Mapping[str, Any]
 ) -> Row:
     """What is found of a sensor."""
+    counts = {
+        f"{name}.{key}": value
+        for name, group in figures.items()
+        if isinstance(group, Mapping)
+        for key, value in group.items()
+    }
     numbers = {
         # The table has a column of names of its own.
         "sensor_name" if name == "sensor" else name: (
             None if isinstance(value, float) and not np.isfinite(value) else value
         )
-        for name, value in figures.items()
+        for name, value in {**figures, **counts}.items()
         if isinstance(value, bool | int | float | str)
     }
     return Row(

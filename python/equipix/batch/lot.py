@@ -13,7 +13,7 @@ import numpy as np
 
 from equipix._check import Array
 from equipix.batch.evaluation import Row
-from equipix.errors import EquipixError
+from equipix.errors import EquipixError, FileError
 from equipix.findings import Finding, Findings, Flag, Severity
 from equipix.io.paths import write_whole
 from equipix.report.figures import name_of
@@ -95,7 +95,9 @@ class Lot(Brief):
                 name: [getattr(row, name) or None for row in self.rows]
                 for name in ("sensor", "status", "verdict", "reason")
             },
-            "findings": [", ".join(each["kind"] for each in row.findings) for row in self.rows],
+            "findings": [
+                ", ".join(dict.fromkeys(each["kind"] for each in row.findings)) for row in self.rows
+            ],
             **{name: [row.figures.get(name) for row in self.rows] for name in figures},
             **{
                 name: [getattr(row, name) or None for row in self.rows]
@@ -113,7 +115,7 @@ class Lot(Brief):
         EquipixError
             If pyarrow, jinja2 or matplotlib is not installed.
         """
-        refuse_no_parquet()
+        _refuse_no_parquet()
         columns, text = self.columns, io.StringIO(newline="")
         table = csv.writer(text)
         table.writerow(columns)
@@ -239,8 +241,15 @@ def _draw(name: str, values: list[float | None], axes: Any) -> None:
     axes.set_title(name_of(name))
 
 
-def refuse_no_parquet() -> None:
-    """Refuse to begin without the library that writes the table."""
+def refuse_no_table(folder: Path) -> None:
+    """Refuse to begin where the table could not be written in the end."""
+    for suffix in (".csv", ".parquet", ".html"):
+        if (taken := folder / f"{LOT}{suffix}").is_dir():
+            raise FileError(f"{taken}: is a folder, expected a file: name another output")
+    _refuse_no_parquet()
+
+
+def _refuse_no_parquet() -> None:
     try:
         import pyarrow as pa  # noqa: F401
     except ImportError as error:

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, get_args
 
 from equipix._check import LOG, FluxModel, Progress, check_type, check_word, positive_workers
-from equipix.batch.cluster import Task, finished
+from equipix.batch.cluster import LOCAL, Task, finished
 from equipix.batch.evaluation import Job, Row, described_by, evaluate, kept, refuse_taken
-from equipix.batch.lot import LOT, Lot, refuse_no_parquet
+from equipix.batch.lot import LOT, Lot, refuse_no_table
 from equipix.batch.memory import bytes_needed
 from equipix.errors import EquipixError, FileError, InputError
 from equipix.experiment.experiment import Experiment
@@ -50,8 +50,8 @@ def run(
     output : path
         Folder of the results, made where it is not there. All workers must see it.
     scheduler : str, optional
-        Address of a scheduler of dask.distributed, such as ``tcp://host:8786``. Unless given, as
-        many worker processes run on this machine as processors and memory allow.
+        Address of a scheduler of dask.distributed, such as ``tcp://host:8786``. Unless given, and
+        for "local", as many worker processes run on this machine as processors and memory allow.
     limits : path, optional
         A limits.toml, by which each result is judged.
     suffix : str
@@ -107,10 +107,11 @@ def run(
     ]
     for job in jobs:
         refuse_taken(job)
-    refuse_no_parquet()
+    refuse_no_table(folder)
     _refuse_as_output(folder)
+    at = None if scheduler == LOCAL else scheduler
     found: dict[str, Row] = {}
-    for row in _rows(jobs, scheduler, workers, progress):
+    for row in _rows(jobs, at, workers, progress):
         found[row.sensor] = row
         LOG.info("%s: %s", row.sensor, row.reason or row.status)
     lot = Lot(tuple(found[job.name] for job in jobs))

@@ -15,7 +15,7 @@ import numpy as np
 
 from equipix._check import Array, Progress
 from equipix._native import __version__
-from equipix.batch.cluster import Task, finished, scheduler_at
+from equipix.batch.cluster import LOCAL, Task, finished, scheduler_at
 from equipix.batch.memory import PROCESS, reading
 from equipix.errors import EquipixError, FileError
 from equipix.experiment.image_files import State, digest, refuse_changed, state_of
@@ -23,9 +23,6 @@ from equipix.io.arrays import chunk_frames
 from equipix.io.formats import FrameFile
 from equipix.io.frames import stream_part
 from equipix.io.paths import write_whole
-
-LOCAL = "local"
-"""In the place of a scheduler's address: worker processes on this machine."""
 
 _HASHED_AT_ONCE = 2**28
 """Bytes of files that one worker hashes at a time; at least a file is."""

@@ -82,10 +82,13 @@ def batch(
         "yield": {name: f"{good} of {of}" for name, (good, of) in lot.yields.items()},
         "reasons": {row.sensor: row.reason for row in lot.failed},
     }
+    reasons = [*result["reasons"].items()]
     if not as_json:
-        result["reasons"] = dict([*result["reasons"].items()][:_MOST_REASONS])
+        del result["reasons"]
         result = {name: value for name, value in result.items() if value != {}}
     terminal.show_result(result, as_json=as_json)
+    if reasons and not as_json:
+        terminal.show_table(("sensor", "why it has no result"), reasons[:_MOST_REASONS])
     if lot.failed:
         raise EquipixError(
             f"{len(lot.failed)} of {len(lot.rows)} sensors gave no result: "

@@ -12,7 +12,7 @@ import numpy as np
 
 from equipix.errors import EquipixError, FileError
 from equipix.experiment.described import excluded_pixels
-from equipix.experiment.image_files import State, state_of
+from equipix.experiment.image_files import State, sha256_of, state_of
 from equipix.experiment.manifest import Exposure, Manifest, read_manifest
 from equipix.exposures.positions import check_reach
 from equipix.findings import Finding
@@ -69,6 +69,7 @@ class WatchedFolder:
     _shapes: dict[Path, _Format] = field(default_factory=dict)
     _seen: dict[Path, tuple[State, float]] = field(default_factory=dict)
     _refused: dict[Path, State] = field(default_factory=dict)
+    _hashes: dict[Path, str] = field(default_factory=dict)
     _reported: set[tuple[Path, str]] = field(default_factory=set)
 
     @property
@@ -161,6 +162,7 @@ class WatchedFolder:
             )
         if position is not None:
             check_reach(f"{file}: 'shift'", np.array(position), kind[0])
+            self._refuse_copy(file)
         running, added = self._begin(kind[0]) if self._running is None else self._running, False
         try:
             for _, frames in stream_frames([file]):
@@ -173,6 +175,16 @@ class WatchedFolder:
                 self._refused = refused
             raise
         self._running, self._wanted = running, wanted
+
+    def _refuse_copy(self, file: Path) -> None:
+        """Refuse a frame with light that has the content of another file: it would count twice."""
+        self._hashes[file] = own = sha256_of([file])[file]
+        for other in self._taken:
+            if other != file and self._hashes.get(other) == own:
+                raise FileError(
+                    f"{file}: is a copy of '{other.name}', expected frames of its own: take them "
+                    "again, or remove one of the files"
+                )
 
     def _begin(self, shape: tuple[int, ...]) -> Running:
         assert self._manifest is not None
