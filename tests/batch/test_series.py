@@ -279,8 +279,8 @@ def test_two_workers_write_the_same_files(writer, tmp_path, correction, cluster)
 def test_a_killed_worker_changes_no_recording(tmp_path, correction, cluster, monkeypatch, place):
     names = zarr(tmp_path, frames_of("uint16"))
     batch.correct(correction, names, tmp_path / "one.zarr", scheduler=None)
-    killed = functools.partial(_killed_once, recordings._corrected, place)
-    monkeypatch.setattr(recordings, "_corrected", killed)
+    killed = functools.partial(_killed_once, recordings._kept_or_corrected, place)
+    monkeypatch.setattr(recordings, "_kept_or_corrected", killed)
     at = cluster.scheduler_address
     batch.correct(correction, names, tmp_path / "two.zarr", scheduler=at)
     assert len(list(tmp_path.glob(f"frames.zarr.*.{len(place)}"))) == 3
