@@ -18,6 +18,7 @@ from equipix import batch, errors
 from equipix.batch import averages, recordings
 from equipix.batch.series import remove_work
 from equipix.correction.correct_files import correct_files
+from equipix.io.arrays import ZarrFrames
 from equipix.io.tiff import write_frames
 
 SHAPE = (24, 32)
@@ -311,7 +312,7 @@ def test_a_recording_goes_on_where_it_was(tmp_path, correction, monkeypatch):
     assert files_in(tmp_path / "one.zarr") == files_in(output)
 
 
-@pytest.mark.parametrize("damage", ["removed", "emptied", "flipped", "mark"])
+@pytest.mark.parametrize("damage", ["removed", "emptied", "flipped", "mark", "metadata"])
 def test_a_piece_that_was_damaged_is_made_again(tmp_path, correction, monkeypatch, damage):
     names, output = zarr(tmp_path, frames_of("uint16")), tmp_path / "out.zarr"
     batch.correct(correction, names, tmp_path / "one.zarr", scheduler=None)
@@ -326,7 +327,11 @@ def test_a_piece_that_was_damaged_is_made_again(tmp_path, correction, monkeypatc
         chunk.unlink()
     elif damage == "mark":
         (mark,) = array.parent.glob("*.250.json")
-        mark.write_text(mark.read_text().replace('"limited":0', '"limited":7'))
+        written = mark.read_text()
+        mark.write_text(written.replace('"limited" : 0', '"limited" : 7'))
+        assert mark.read_text() != written
+    elif damage == "metadata":
+        (array / "zarr.json").write_bytes(b"")
     else:
         chunk.write_bytes(b"" if damage == "emptied" else bytes([content[0] ^ 1, *content[1:]]))
     counts = batch.correct(correction, names, output, scheduler=None)
@@ -334,14 +339,36 @@ def test_a_piece_that_was_damaged_is_made_again(tmp_path, correction, monkeypatc
     assert files_in(tmp_path / "one.zarr") == files_in(output)
 
 
-def test_a_recording_that_lacks_a_chunk_is_refused(tmp_path, correction):
-    names = zarr(tmp_path, frames_of("uint16"))
-    (tmp_path / "frames.zarr" / "c" / "3" / "0" / "0").unlink()
-    words = r"frames\.zarr: lacks 1 of 12 chunks, which would be read as 0: copy it again"
+@pytest.mark.parametrize(
+    ("options", "chunk"),
+    [
+        ({"chunks": (50, *SHAPE)}, "c/3/0/0"),
+        ({"chunks": (10, 12, 32), "shards": (50, *SHAPE)}, "c/3/0/0"),
+        ({"chunks": (50, 12, 32), "zarr_format": 2}, "3.1.0"),
+    ],
+    ids=["chunks", "shards", "format 2"],
+)
+@pytest.mark.parametrize("place", ["", "entry/data"])
+def test_a_zarr_array_that_lacks_a_chunk_is_refused(tmp_path, options, chunk, place):
+    frames, file = frames_of("uint16"), tmp_path / "frames.zarr"
+    array = pytest.importorskip("zarr").create_array(
+        str(file), name=place or None, shape=frames.shape, dtype=frames.dtype, **options
+    )
+    array[:] = frames
+    agree(equipix.average(file), equipix.average(frames))
+    (file / place / chunk).unlink()
+    words = f"lacks the chunk '{file / place / chunk}', which would be read as 0: copy it again"
     with pytest.raises(errors.FileError, match=words):
-        batch.correct(correction, names, tmp_path / "out.zarr", scheduler=None)
-    with pytest.raises(errors.FileError, match=words):
-        equipix.average(names)
+        equipix.average(file)
+
+
+def test_chunks_of_zeros_are_written(tmp_path):
+    pytest.importorskip("zarr")
+    array, frames = ZarrFrames(tmp_path / "out.zarr"), np.zeros((20, *SHAPE), np.uint8)
+    array.create(frames.shape, frames.dtype, 10)
+    for start in (0, 10):
+        array.write(start, frames[start : start + 10])
+    np.testing.assert_array_equal(equipix.average(array.path).mean, np.zeros(SHAPE))
 
 
 @pytest.mark.filterwarnings("ignore:100% of the corrected values")

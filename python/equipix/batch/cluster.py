@@ -4,7 +4,7 @@ import logging
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing import resource_tracker
 from threading import Lock
 from typing import Any, NamedTuple, TypeVar
@@ -113,20 +113,19 @@ def _round(
 
 def _ended(client: Any, left: Any) -> Iterator[Any]:
     """Futures as they end; where all workers are gone it warns, and waits for others."""
-    asked, gone = time.monotonic(), False
+    asked, without = time.monotonic(), 0
     while not left.is_empty():
         yield from left.next_batch(block=False)
         time.sleep(_POLL_S)
-        if time.monotonic() - asked < _TIMEOUT_S:
+        if time.monotonic() - asked < _TIMEOUT_S / 2:
             continue
-        asked, before = time.monotonic(), gone
-        try:
-            gone = not client.nthreads()
-        except (OSError, AttributeError):  # the scheduler ended, and so will the futures
-            continue
-        if gone and not before:
+        asked = time.monotonic()
+        with suppress(OSError, AttributeError):  # the scheduler ended, and so will the futures
+            without = 0 if client.nthreads() else without + 1
+        if without == 2:  # not while one is just started again
             words = f"there is no worker for {left.count()} tasks, which wait: {_START}"
             say(Finding("workers", words, "input"))
+            without += 1
 
 
 def _in_words(error: BaseException) -> str:

@@ -38,7 +38,7 @@ _PLACES = 48
 """Most rows and columns of the map of flagged pixels that a row holds; its parts are as square as
 whole pixels allow."""
 
-_FORM = 3
+_FORM = 4
 """Form of a row: a sensor whose row has another one is evaluated again."""
 
 

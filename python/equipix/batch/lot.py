@@ -218,7 +218,8 @@ def _beyond(row: Row) -> list[str]:
 def _against(row: Row) -> list[str]:
     """What speaks against a sensor: kinds of findings, and figures beyond their limits."""
     beyond = [f"beyond the limit of {name_of(each)}" for each in _beyond(row)]
-    return [each["kind"].replace("_", " ") for each in row.findings] + beyond
+    kinds = dict.fromkeys(each["kind"].replace("_", " ") for each in row.findings)
+    return [*kinds, *beyond]
 
 
 def _some(names: list[str]) -> str:

@@ -177,11 +177,12 @@ def correct(
             _Job(array.path, piece, chunk, at, hashes[place], state, options, place_of_dark)
             for piece in pieces
         ]
-        if not array.exists():
+        shape = given.count, *given.shape
+        if not array.exists(shape, wanted, chunk):
             for job in jobs:
                 job.mark.unlink(missing_ok=True)
             history = [f"dark: {darks.named(files[0])}", f"{bad} flagged pixels: {how}"]
-            shape, mark = (given.count, *given.shape), f"{MARK}, {origin}"
+            mark = f"{MARK}, {origin}"
             array.create(shape, wanted, chunk, description=mark, history=history)
         series.results(_kept_or_corrected, jobs, memory[0], "correcting")
         series.refuse_changed([job.mark for job in jobs])
@@ -249,7 +250,7 @@ class _Job:
         first = self.piece.start
         return ZarrFrames(self.array).sha256(first, first + self.piece.length)
 
-    def told(self) -> dict[str, Any]:
+    def record(self) -> dict[str, Any]:
         """What the mark says: the hash of the chunks, and what was counted; nothing without one."""
         try:
             return checked(self.mark.read_text()) or {}
@@ -258,9 +259,9 @@ class _Job:
 
     def is_kept(self) -> bool:
         """Whether the piece is as it was written."""
-        told = self.told()
+        record = self.record()
         try:
-            return bool(told) and told["sha256"] == self.sha256
+            return bool(record) and record["sha256"] == self.sha256
         except OSError:
             return False
 
@@ -269,10 +270,10 @@ def _total(jobs: list[_Job]) -> Counter[str]:
     """What was counted in all."""
     total: Counter[str] = Counter()
     for job in jobs:
-        told = job.told()
-        if not told:
+        record = job.record()
+        if not record:
             raise FileError(f"{job.mark}: was removed meanwhile: call again")
-        total.update(told["counts"])
+        total.update(record["counts"])
     return total
 
 

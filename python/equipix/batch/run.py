@@ -90,7 +90,8 @@ def run(
     the hash of its inputs, options, limits and version, and the hashes of its result and its page,
     is kept as it is: a lot that was interrupted goes on where it was. Nothing but rows travels
     through the scheduler. A worker takes a sensor when the memory for it is free. Where all workers
-    are gone, an `InputWarning` says so within a minute, and the lot waits for others.
+    are gone, an `InputWarning` says so within a minute, and the lot waits for others. Dask logs
+    nothing in this process meanwhile.
     """
     if unknown := sorted(set(options) - _OPTIONS):
         known = ", ".join(sorted(_OPTIONS))

@@ -39,7 +39,9 @@ def batch(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the results.")],
     scheduler: Annotated[
         str | None,
-        typer.Option(help="A running scheduler of dask: tcp://HOST:PORT; else this machine."),
+        typer.Option(
+            help="A running scheduler of dask, tcp://HOST:PORT; else this machine, local."
+        ),
     ] = None,
     suffix: Annotated[
         str, typer.Option(help=f"Format of the results: {', '.join(SUFFIXES)}.")
@@ -82,13 +84,12 @@ def batch(
         "yield": {name: f"{good} of {of}" for name, (good, of) in lot.yields.items()},
         "reasons": {row.sensor: row.reason for row in lot.failed},
     }
-    reasons = [*result["reasons"].items()]
     if not as_json:
-        del result["reasons"]
-        result = {name: value for name, value in result.items() if value != {}}
+        reasons = [f"{row.sensor}: {row.reason}" for row in lot.failed]
+        more = [f"and {len(reasons) - _MOST_REASONS} more"] * (len(reasons) > _MOST_REASONS)
+        result["reasons"] = "\n".join([*reasons[:_MOST_REASONS], *more])
+        result = {name: value for name, value in result.items() if value not in ({}, "")}
     terminal.show_result(result, as_json=as_json)
-    if reasons and not as_json:
-        terminal.show_table(("sensor", "why it has no result"), reasons[:_MOST_REASONS])
     if lot.failed:
         raise EquipixError(
             f"{len(lot.failed)} of {len(lot.rows)} sensors gave no result: "

@@ -6,6 +6,7 @@ names as the default.
 """
 
 import hashlib
+import itertools
 import math
 import os
 import re
@@ -63,24 +64,12 @@ def header(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any], str]:
         return (int(np.prod(above)), rows, cols), np.dtype(array.dtype).newbyteorder("="), text
 
 
-def _refuse_missing_chunks(path: Path, array: Any) -> None:
-    """Refuse a Zarr array that lacks files of chunks, which are read as the fill value."""
-    stored = array.shards or array.chunks
-    wanted = math.prod(math.ceil(n / side) for n, side in zip(array.shape, stored, strict=True))
-    there = array.nchunks_initialized * math.prod(array.chunks) // math.prod(stored)
-    if there < wanted:
-        raise FileError(
-            f"{path}: lacks {wanted - there} of {wanted} chunks, which would be read as "
-            f"{array.fill_value}: copy it again, or write it whole (of zarr: write_empty_chunks)"
-        )
-
-
 def stream_frames(path: Path, start: int = 0, stop: int | None = None) -> Iterator[NDArray[Any]]:
     """Frames of a file, some at a time, each part of shape (n, rows, cols); no chunk twice."""
     with _opened(path) as array:
         *above, _, _ = array.shape
         if not above:
-            yield native(array[:, :])[None]
+            yield native(_read(path, array, ()))[None]
             return
         *outer, inner = above
         count = _at_once(array)
@@ -89,7 +78,34 @@ def stream_frames(path: Path, start: int = 0, stop: int | None = None) -> Iterat
             here = range(inner)[max(start - number * inner, 0) : max(stop - number * inner, 0)]
             for first in range(here.start // count * count, here.stop, count):
                 part = slice(max(first, here.start), min(first + count, here.stop))
-                yield native(array[(*place, part)])
+                yield native(_read(path, array, (*place, part)))
+
+
+def _read(path: Path, array: Any, place: tuple[int | slice, ...]) -> Any:
+    """Read frames; refuse those of which files of a Zarr array are missing.
+
+    They would be read as the fill value.
+    """
+    if split(path)[0].suffix.lower() in ZARR:
+        whole = (*place, slice(None), slice(None))
+        ranges = [
+            range(n)[each] if isinstance(each, slice) else range(each, each + 1)
+            for each, n in zip(whole, array.shape, strict=True)
+        ]
+        sides = array.shards or array.chunks
+        parts = [
+            range(each.start // side, math.ceil(each.stop / side))
+            for each, side in zip(ranges, sides, strict=True)
+        ]
+        for chunk in itertools.product(*parts):
+            file = Path(split(path)[0], array.path, array.metadata.encode_chunk_key(chunk))
+            if not file.exists():
+                raise FileError(
+                    f"{path}: lacks the chunk '{file}', which would be read as "
+                    f"{array.fill_value}: copy it again, or write chunks of one value too (of "
+                    "zarr: write_empty_chunks)"
+                )
+    return array[place]
 
 
 def chunk_frames(path: Path) -> int:
@@ -128,8 +144,6 @@ def _opened(path: Path) -> Iterator[Any]:
     suffix = file.suffix.lower()
     opened = _npy if suffix == ".npy" else _hdf5 if suffix in HDF5 else _zarr
     with opened(file, place) as array:
-        if opened is _zarr:
-            _refuse_missing_chunks(path, array)
         if array.ndim < 2 or 0 in array.shape or np.dtype(array.dtype).kind not in "uif":
             raise FileError(
                 f"{path}: is {array.dtype} of shape {array.shape}, expected numbers of shape "
@@ -226,9 +240,14 @@ class ZarrFrames:
             overwrite=True,
         )
 
-    def exists(self) -> bool:
-        """Whether the array is made."""
-        return (self.path / "zarr.json").exists()
+    def exists(self, shape: tuple[int, int, int], dtype: np.dtype[Any], chunk: int) -> bool:
+        """Whether such an array is made."""
+        try:
+            array = _zarr_library().open_array(str(self.path), mode="r")
+        except (OSError, ValueError, KeyError, TypeError):  # none, or a damaged one
+            return False
+        made = array.shape, array.dtype, array.chunks
+        return bool(made == (shape, dtype, (chunk, *shape[1:])))
 
     def clean(self) -> None:
         """Remove what processes that were killed left of chunks they had begun."""
@@ -238,7 +257,7 @@ class ZarrFrames:
     def write(self, start: int, frames: NDArray[Any]) -> None:
         """Write one chunk, or the last frames, and wait until they are on the disk."""
         zarr = _zarr_library()
-        # Else a chunk of zeros would be none, as one that was lost.
+        # It would leave out chunks of zeros, and a chunk that was lost would look the same.
         with zarr.config.set({"array.write_empty_chunks": True}):
             array = zarr.open_array(str(self.path), mode="r+")
             array[start : start + len(frames)] = frames

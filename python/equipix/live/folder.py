@@ -69,7 +69,7 @@ class WatchedFolder:
     _shapes: dict[Path, _Format] = field(default_factory=dict)
     _seen: dict[Path, tuple[State, float]] = field(default_factory=dict)
     _refused: dict[Path, State] = field(default_factory=dict)
-    _hashes: dict[Path, str] = field(default_factory=dict)
+    _contents: dict[str, tuple[Path, tuple[float, float] | None]] = field(default_factory=dict)
     _reported: set[tuple[Path, str]] = field(default_factory=set)
 
     @property
@@ -116,7 +116,8 @@ class WatchedFolder:
         found = self._read_manifest()
         files, waiting = self._files(), False
         new, begun = self._forget_changed(files), self._begun
-        for file, (position, state) in files.items():
+        # The older of two copies counts, also when a new process reads all files again.
+        for file, (position, state) in sorted(files.items(), key=lambda it: (it[1][1][1], it[0])):
             if state in (self._taken.get(file), self._refused.get(file)):
                 continue
             age = self._age(file, state)
@@ -162,7 +163,13 @@ class WatchedFolder:
             )
         if position is not None:
             check_reach(f"{file}: 'shift'", np.array(position), kind[0])
-            self._refuse_copy(file)
+        content = sha256_of([file])[file]
+        other, its = self._contents.get(content, (file, position))
+        if other != file and (position, its) != (None, None):  # a camera may show 0 in the dark
+            raise FileError(
+                f"{file}: is a copy of '{other.name}', expected frames of its own: take them "
+                "again, or remove one of the files"
+            )
         running, added = self._begin(kind[0]) if self._running is None else self._running, False
         try:
             for _, frames in stream_frames([file]):
@@ -175,16 +182,7 @@ class WatchedFolder:
                 self._refused = refused
             raise
         self._running, self._wanted = running, wanted
-
-    def _refuse_copy(self, file: Path) -> None:
-        """Refuse a frame with light that has the content of another file: it would count twice."""
-        self._hashes[file] = own = sha256_of([file])[file]
-        for other in self._taken:
-            if other != file and self._hashes.get(other) == own:
-                raise FileError(
-                    f"{file}: is a copy of '{other.name}', expected frames of its own: take them "
-                    "again, or remove one of the files"
-                )
+        self._contents.setdefault(content, (file, position))
 
     def _begin(self, shape: tuple[int, ...]) -> Running:
         assert self._manifest is not None
@@ -199,7 +197,7 @@ class WatchedFolder:
 
     def _forget(self) -> None:
         """Begin anew: sums do not give back what was added."""
-        self._running, self._taken, self._refused = None, {}, {}
+        self._running, self._taken, self._refused, self._contents = None, {}, {}, {}
 
     def _forget_changed(self, files: dict[Path, tuple[Any, State]]) -> bool:
         """Begin anew where a file that was taken has changed or is gone."""
@@ -209,6 +207,7 @@ class WatchedFolder:
         if kept:
             return False
         self._forget()
+        self._shapes.clear()
         return True
 
     def _finding(self, file: Path, message: str) -> list[Finding]:
