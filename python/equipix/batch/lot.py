@@ -95,9 +95,7 @@ class Lot(Brief):
                 name: [getattr(row, name) or None for row in self.rows]
                 for name in ("sensor", "status", "verdict", "reason")
             },
-            "findings": [
-                ", ".join(dict.fromkeys(each["kind"] for each in row.findings)) for row in self.rows
-            ],
+            "findings": [", ".join(_kinds(row)) for row in self.rows],
             **{name: [row.figures.get(name) for row in self.rows] for name in figures},
             **{
                 name: [getattr(row, name) or None for row in self.rows]
@@ -218,8 +216,12 @@ def _beyond(row: Row) -> list[str]:
 def _against(row: Row) -> list[str]:
     """What speaks against a sensor: kinds of findings, and figures beyond their limits."""
     beyond = [f"beyond the limit of {name_of(each)}" for each in _beyond(row)]
-    kinds = dict.fromkeys(each["kind"].replace("_", " ") for each in row.findings)
-    return [*kinds, *beyond]
+    return [each.replace("_", " ") for each in _kinds(row)] + beyond
+
+
+def _kinds(row: Row) -> list[str]:
+    """Kinds of findings, each once: those of colour planes are often alike."""
+    return [*dict.fromkeys(each["kind"] for each in row.findings)]
 
 
 def _some(names: list[str]) -> str:

@@ -86,7 +86,8 @@ def _read(path: Path, array: Any, place: tuple[int | slice, ...]) -> Any:
 
     They would be read as the fill value.
     """
-    if split(path)[0].suffix.lower() in ZARR:
+    folder, _ = split(path)
+    if folder.suffix.lower() in ZARR:
         whole = (*place, slice(None), slice(None))
         ranges = [
             range(n)[each] if isinstance(each, slice) else range(each, each + 1)
@@ -98,7 +99,7 @@ def _read(path: Path, array: Any, place: tuple[int | slice, ...]) -> Any:
             for each, side in zip(ranges, sides, strict=True)
         ]
         for chunk in itertools.product(*parts):
-            file = Path(split(path)[0], array.path, array.metadata.encode_chunk_key(chunk))
+            file = Path(folder, array.path, array.metadata.encode_chunk_key(chunk))
             if not file.exists():
                 raise FileError(
                     f"{path}: lacks the chunk '{file}', which would be read as "
