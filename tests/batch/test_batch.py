@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+import warnings
 from dataclasses import asdict
 from importlib import import_module
 from itertools import pairwise
@@ -21,8 +22,10 @@ import pytest
 
 import equipix
 from equipix import batch, errors, simulate
+from equipix.batch import cluster as cluster_of_dask
 from equipix.batch.cluster import Task, finished, scheduler_at
 from equipix.batch.evaluation import Job, Row, _flagged, described_by, evaluate, refuse_taken
+from equipix.batch.lot import Lot
 from equipix.io.formats import checked, with_checksum
 from equipix.io.tiff import write_frames
 from equipix.report.limits import LimitsFile, limits_template
@@ -286,10 +289,42 @@ def test_where_all_workers_are_gone_a_warning_says_so(tmp_path, monkeypatch):
         cluster.scale(0)
         comes = threading.Timer(5, cluster.scale, [1])
         comes.start()
-        with pytest.warns(errors.EquipixWarning, match=r"no worker for [12] tasks"):
+        with pytest.warns(errors.EquipixWarning, match=r"no worker of 1\.0 GB for [12] tasks"):
             rows = [row for _, row in found]
         comes.join()
     assert [row.status for row in rows] == ["done"] * 2
+
+
+@pytest.mark.parametrize(
+    ("largest", "warned"),
+    [([0, 0, 0], 1), ([0, 9, 0], 0), ([2, 2, 2], 1), ([3, 3, 3], 0), ([0, OSError, 0], 1)],
+    ids=["gone", "started again", "too small", "large enough", "scheduler away for a moment"],
+)
+def test_it_warns_once_where_no_worker_has_the_memory_for_long(monkeypatch, largest, warned):
+    looks = iter(largest)
+
+    class Left:
+        def is_empty(self):
+            return not looks.__length_hint__()
+
+        def next_batch(self, *, block):
+            assert not block
+            return []
+
+    def declared(_):
+        found = next(looks)
+        if found is OSError:
+            raise found
+        return found
+
+    monkeypatch.setattr(cluster_of_dask, "_TIMEOUT_S", 0)
+    monkeypatch.setattr(cluster_of_dask, "_POLL_S", 0)
+    monkeypatch.setattr(cluster_of_dask, "_declared", declared)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        sent = {"one": Task(None, 3), "other": Task(None, 7)}
+        assert not [*cluster_of_dask._ended(None, Left(), sent)]
+    assert len(said) == warned
 
 
 def _deadly(job, _):
@@ -469,6 +504,18 @@ def test_the_command_tells_states_and_reasons(lot, tmp_path, run_command, cluste
     assert "1 of 3 sensors gave no result" in err
     _, out, _ = run_command("batch", *given)
     assert re.search(r"^reasons +a-experiment: .*dark", out, re.M)
+
+
+def test_the_command_lists_the_first_reasons(run_command, monkeypatch, tmp_path):
+    rows = tuple(Row(f"s{k:02}", "", status="failed", reason=f"why {k}") for k in range(12))
+    monkeypatch.setattr("equipix.cli.batch.run", lambda *_, **__: Lot(rows))
+    (tmp_path / "experiment.toml").touch()
+    status, out, _ = run_command("batch", tmp_path / "experiment.toml", "-o", tmp_path)
+    assert status == 1
+    assert "s09: why 9" in out
+    assert "s10" not in out
+    assert "and 2 more" in out
+    assert "yield" not in out
 
 
 @pytest.fixture

@@ -18,6 +18,7 @@ from equipix import batch, errors
 from equipix.batch import averages, recordings
 from equipix.batch.series import remove_work
 from equipix.correction.correct_files import correct_files
+from equipix.io import arrays
 from equipix.io.arrays import ZarrFrames
 from equipix.io.tiff import write_frames
 
@@ -312,7 +313,9 @@ def test_a_recording_goes_on_where_it_was(tmp_path, correction, monkeypatch):
     assert files_in(tmp_path / "one.zarr") == files_in(output)
 
 
-@pytest.mark.parametrize("damage", ["removed", "emptied", "flipped", "mark", "metadata"])
+@pytest.mark.parametrize(
+    "damage", ["removed", "emptied", "flipped", "mark", "metadata", "description", "separator"]
+)
 def test_a_piece_that_was_damaged_is_made_again(tmp_path, correction, monkeypatch, damage):
     names, output = zarr(tmp_path, frames_of("uint16")), tmp_path / "out.zarr"
     batch.correct(correction, names, tmp_path / "one.zarr", scheduler=None)
@@ -332,11 +335,39 @@ def test_a_piece_that_was_damaged_is_made_again(tmp_path, correction, monkeypatc
         assert mark.read_text() != written
     elif damage == "metadata":
         (array / "zarr.json").write_bytes(b"")
+    elif damage in ("description", "separator"):
+        was, new = {
+            "description": ("corrected", "corrcted_"),
+            "separator": ('"separator": "/"', '"separator": "."'),
+        }[damage]
+        written = (array / "zarr.json").read_text()
+        (array / "zarr.json").write_text(written.replace(was, new))
+        assert (array / "zarr.json").read_text() != written
     else:
         chunk.write_bytes(b"" if damage == "emptied" else bytes([content[0] ^ 1, *content[1:]]))
     counts = batch.correct(correction, names, output, scheduler=None)
     assert counts.limited == 0
     assert files_in(tmp_path / "one.zarr") == files_in(output)
+
+
+def test_a_disk_that_fails_for_a_moment_costs_no_piece(tmp_path, correction, monkeypatch):
+    zarrs = pytest.importorskip("zarr")
+    names, output = zarr(tmp_path, frames_of("uint16")), tmp_path / "out.zarr"
+    monkeypatch.setattr(recordings, "_total", lambda _: (_ for _ in ()).throw(errors.FileError))
+    with pytest.raises(errors.FileError):
+        batch.correct(correction, names, output, scheduler=None)
+    monkeypatch.undo()
+    before, opened = files_in(tmp_path / "out.zarr.parts"), zarrs.open_array
+
+    def failing(path, **given):
+        if ".parts" in path:
+            raise OSError(5, "Input/output error")
+        return opened(path, **given)
+
+    monkeypatch.setattr(zarrs, "open_array", failing)
+    with pytest.raises(errors.FileError, match="Input/output error"):
+        batch.correct(correction, names, output, scheduler=None)
+    assert files_in(tmp_path / "out.zarr.parts") == before
 
 
 @pytest.mark.parametrize(
@@ -358,14 +389,32 @@ def test_a_zarr_array_that_lacks_a_chunk_is_refused(tmp_path, options, chunk, pl
     agree(equipix.average(file), equipix.average(frames))
     (file / place / chunk).unlink()
     words = f"lacks the chunk '{file / place / chunk}', which would be read as 0: copy it again"
+    for refused in (equipix.average, arrays.header):  # before frames are read, too
+        with pytest.raises(errors.FileError, match=words):
+            refused(file)
+    until = arrays.stream_frames(file, 0, 150)
+    np.testing.assert_array_equal(np.concatenate([*until]), frames[:150])
     with pytest.raises(errors.FileError, match=words):
-        equipix.average(file)
+        [*arrays.stream_frames(file, 100, 151)]
+
+
+def test_a_missing_chunk_of_frames_by_two_indices_is_refused(tmp_path):
+    frames, file = frames_of("uint16", 12).reshape(3, 4, *SHAPE), tmp_path / "frames.zarr"
+    array = pytest.importorskip("zarr").create_array(
+        str(file), shape=frames.shape, dtype=frames.dtype, chunks=(2, 2, 12, *SHAPE[1:])
+    )
+    array[:] = frames
+    (file / "c" / "1" / "0" / "1" / "0").unlink()  # of frame (2, 0) and (2, 1)
+    until = arrays.stream_frames(file, 0, 8)
+    np.testing.assert_array_equal(np.concatenate([*until]), frames[:2].reshape(8, *SHAPE))
+    with pytest.raises(errors.FileError, match="lacks the chunk .*c/1/0/1/0'"):
+        [*arrays.stream_frames(file, 8, 9)]
 
 
 def test_chunks_of_zeros_are_written(tmp_path):
     pytest.importorskip("zarr")
     array, frames = ZarrFrames(tmp_path / "out.zarr"), np.zeros((20, *SHAPE), np.uint8)
-    array.create(frames.shape, frames.dtype, 10)
+    array.ensure(frames.shape, frames.dtype, 10)
     for start in (0, 10):
         array.write(start, frames[start : start + 10])
     np.testing.assert_array_equal(equipix.average(array.path).mean, np.zeros(SHAPE))

@@ -60,7 +60,9 @@ def counts(found: WatchedFolder) -> tuple[int, ...]:
     assert found.running is not None
     estimate = found.running.estimate()
     frames = dict(zip(map(tuple, estimate.positions.tolist()), estimate.frames, strict=True))
-    return tuple(frames[each] for each in map(tuple, SHIFTS.tolist()) if each in frames)
+    places = list(map(tuple, SHIFTS.tolist()))
+    assert set(frames) <= set(places)
+    return tuple(frames[each] for each in places if each in frames)
 
 
 def test_the_answer_is_that_of_equipix_calibrate(tmp_path: Path) -> None:
@@ -129,18 +131,48 @@ def test_files_at_a_position_beyond_the_sensor_are_refused_once(tmp_path: Path) 
 
 
 @pytest.mark.parametrize(("of", "copy"), [("p1-0", "p4-9"), ("p4-0", "p1-9"), ("dark-0", "p1-9")])
-def test_a_copy_does_not_count_twice(tmp_path: Path, of: str, copy: str) -> None:
-    """The older file counts, whether it is read first or a new process reads both."""
+@pytest.mark.parametrize("later", [4, 0, -4])
+def test_of_copies_the_oldest_counts(tmp_path: Path, of: str, copy: str, later: int) -> None:
+    """Whichever was seen first, and in a new process; by name if they are equally old."""
     found = watched(tmp_path)
     all_frames(tmp_path)
-    written(tmp_path / "dark-9.tif", DARK[0])  # a camera may show 0 in the dark
+    written(tmp_path / "dark-x.tif", DARK[1])  # a camera may show 0 in the dark
     found.look()
-    content = tifffile.imread(tmp_path / f"{of}.tif")
-    written(tmp_path / f"{copy}.tif", content, age=6)
+    files = [tmp_path / f"{each}.tif" for each in (of, copy)]
+    files[1].write_bytes(files[0].read_bytes())
+    os.utime(files[1], ns=(files[0].stat().st_mtime_ns + later * 10**9,) * 2)
+    counting, refused = sorted(files, key=lambda file: (file.stat().st_mtime_ns, file))
     for each in (found, watched(tmp_path)):
         _, _, (finding,) = each.look()
-        assert finding.message.startswith(f"{tmp_path / copy}.tif: is a copy of '{of}.tif'")
-        assert counts(each) == (2,) * 6
+        assert finding.message.startswith(f"{refused}: is a copy of '{counting}', which counts")
+        frames = [file for file in tmp_path.glob("p*.tif") if file != refused]
+        assert counts(each) == tuple(
+            sum(file.name.startswith(f"p{k}") for file in frames) for k in range(6)
+        )
+        assert each.look() == (False, False, [])
+
+
+def test_what_is_not_used_is_reported_once_whatever_is_read_again(tmp_path: Path) -> None:
+    found = watched(tmp_path)
+    written(tmp_path / "dark-x.tif", np.ones((30, 40), np.uint16), age=20)
+    all_frames(tmp_path)
+    assert len(found.look()[2]) == 1
+    (tmp_path / "p3-1.tif").unlink()
+    assert found.look() == (True, False, [])
+    assert counts(found) == (2, 2, 2, 1, 2, 2)
+
+
+def test_a_broken_manifest_is_reported_also_where_all_is_read_again(tmp_path: Path) -> None:
+    found = watched(tmp_path)
+    all_frames(tmp_path)
+    found.look()
+    with found.path.open("a") as file:
+        file.write("shift = [")
+    written(tmp_path / "p0-9.tif", FRAMES[1][0], age=60)  # an older copy
+    assert [each.message.partition(": ")[0] for each in found.look()[2]] == [
+        str(found.path),
+        str(tmp_path / "p1-0.tif"),
+    ]
 
 
 def test_a_file_that_vanishes_or_changes_no_longer_counts(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ import logging
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from multiprocessing import resource_tracker
 from threading import Lock
 from typing import Any, NamedTuple, TypeVar
@@ -95,7 +95,7 @@ def _round(
     left = as_completed([send(task) for task in tasks if task.memory <= largest])
     suspects: list[Task] = []
     is_alone = False
-    for future in _ended(client, left):
+    for future in _ended(client, left, sent):
         task = sent.pop(future)
         if future.status == "finished":
             yield task, future.result()
@@ -111,8 +111,8 @@ def _round(
             left.add(send(suspects.pop()))
 
 
-def _ended(client: Any, left: Any) -> Iterator[Any]:
-    """Futures as they end; where all workers are gone it warns, and waits for others."""
+def _ended(client: Any, left: Any, sent: dict[Any, Task]) -> Iterator[Any]:
+    """Futures as they end; where no worker that is left has the memory for one, it warns."""
     asked, without = time.monotonic(), 0
     while not left.is_empty():
         yield from left.next_batch(block=False)
@@ -120,12 +120,14 @@ def _ended(client: Any, left: Any) -> Iterator[Any]:
         if time.monotonic() - asked < _TIMEOUT_S / 2:
             continue
         asked = time.monotonic()
-        with suppress(OSError, AttributeError):  # the scheduler ended, and so will the futures
-            without = 0 if client.nthreads() else without + 1
+        least = min(task.memory for task in sent.values())
+        try:
+            without = 0 if _declared(client) >= least else without + 1
+        except (OSError, AttributeError):  # the scheduler ended, and so will the futures
+            continue
         if without == 2:  # not while one is just started again
-            words = f"there is no worker for {left.count()} tasks, which wait: {_START}"
-            say(Finding("workers", words, "input"))
-            without += 1
+            words = f"there is no worker of {least / 1e9:.1f} GB for {len(sent)} tasks, which wait"
+            say(Finding("workers", f"{words}: {_START}", "input"))
 
 
 def _in_words(error: BaseException) -> str:
@@ -248,16 +250,15 @@ def _largest(client: Any, wanted: int) -> int:
     """Bytes of the largest worker, once one has as many as wanted, or none has come for long."""
     _wait(client)
     end = time.monotonic() + _TIMEOUT_S
-    while (largest := _declared(client)) < wanted and time.monotonic() < end:
+    while largest := _declared(client):
+        if largest >= wanted or time.monotonic() > end:
+            return largest
         time.sleep(0.5)
-    return largest
+    # A worker that a nanny starts again has what it was started with, and nothing else.
+    raise EquipixError(f"no worker declares its memory: {_START}, such as {_MEMORY}=16e9")
 
 
 def _declared(client: Any) -> int:
-    """Bytes of the largest worker that is there."""
+    """Bytes of the largest worker that is there; 0 where none declares them."""
     workers = client.sync(client.scheduler.identity, n_workers=-1)["workers"].values()
-    declared = [int(each["resources"].get(_MEMORY, 0)) for each in workers]
-    if not any(declared):
-        # A worker that a nanny starts again has what it was started with, and nothing else.
-        raise EquipixError(f"no worker declares its memory: {_START}, such as {_MEMORY}=16e9")
-    return max(declared)
+    return max((int(each["resources"].get(_MEMORY, 0)) for each in workers), default=0)

@@ -178,12 +178,9 @@ def correct(
             for piece in pieces
         ]
         shape = given.count, *given.shape
-        if not array.exists(shape, wanted, chunk):
-            for job in jobs:
-                job.mark.unlink(missing_ok=True)
-            history = [f"dark: {darks.named(files[0])}", f"{bad} flagged pixels: {how}"]
-            mark = f"{MARK}, {origin}"
-            array.create(shape, wanted, chunk, description=mark, history=history)
+        history = [f"dark: {darks.named(files[0])}", f"{bad} flagged pixels: {how}"]
+        with writing(array.path):
+            array.ensure(shape, wanted, chunk, description=f"{MARK}, {origin}", history=history)
         series.results(_kept_or_corrected, jobs, memory[0], "correcting")
         series.refuse_changed([job.mark for job in jobs])
         counts = _total(jobs)
@@ -272,7 +269,7 @@ def _total(jobs: list[_Job]) -> Counter[str]:
     for job in jobs:
         record = job.record()
         if not record:
-            raise FileError(f"{job.mark}: was removed meanwhile: call again")
+            raise FileError(f"{job.mark}: is missing or damaged: call again")
         total.update(record["counts"])
     return total
 

@@ -81,14 +81,16 @@ def batch(
         "output": str(output),
         "sensors": len(lot.rows),
         **{status: states.count(status) for status in ("done", "kept", "failed")},
-        "yield": {name: f"{good} of {of}" for name, (good, of) in lot.yields.items()},
-        "reasons": {row.sensor: row.reason for row in lot.failed},
     }
-    if not as_json:
-        reasons = [f"{row.sensor}: {row.reason}" for row in lot.failed]
-        more = [f"and {len(reasons) - _MOST_REASONS} more"] * (len(reasons) > _MOST_REASONS)
-        result["reasons"] = "\n".join([*reasons[:_MOST_REASONS], *more])
-        result = {name: value for name, value in result.items() if value not in ({}, "")}
+    yields = {name: f"{good} of {of}" for name, (good, of) in lot.yields.items()}
+    if as_json or yields:
+        result["yield"] = yields
+    if as_json:
+        result["reasons"] = {row.sensor: row.reason for row in lot.failed}
+    elif lot.failed:
+        reasons = [f"{row.sensor}: {row.reason}" for row in lot.failed[:_MOST_REASONS]]
+        more = len(lot.failed) - _MOST_REASONS
+        result["reasons"] = "\n".join([*reasons, *([f"and {more} more"] if more > 0 else [])])
     terminal.show_result(result, as_json=as_json)
     if lot.failed:
         raise EquipixError(

@@ -59,6 +59,7 @@ def split(path: Path) -> tuple[Path, str]:
 def header(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any], str]:
     """Shape (n, rows, cols) and dtype of the frames; the text that `ZarrFrames` writes."""
     with _opened(path) as array:
+        _refuse_missing(path, array, ())
         *above, rows, cols = array.shape
         text = _text(array, _MARK).strip() if hasattr(array, "attrs") else ""
         return (int(np.prod(above)), rows, cols), np.dtype(array.dtype).newbyteorder("="), text
@@ -82,31 +83,36 @@ def stream_frames(path: Path, start: int = 0, stop: int | None = None) -> Iterat
 
 
 def _read(path: Path, array: Any, place: tuple[int | slice, ...]) -> Any:
-    """Read frames; refuse those of which files of a Zarr array are missing.
-
-    They would be read as the fill value.
-    """
-    folder, _ = split(path)
-    if folder.suffix.lower() in ZARR:
-        whole = (*place, slice(None), slice(None))
-        ranges = [
-            range(n)[each] if isinstance(each, slice) else range(each, each + 1)
-            for each, n in zip(whole, array.shape, strict=True)
-        ]
-        sides = array.shards or array.chunks
-        parts = [
-            range(each.start // side, math.ceil(each.stop / side))
-            for each, side in zip(ranges, sides, strict=True)
-        ]
-        for chunk in itertools.product(*parts):
-            file = Path(folder, array.path, array.metadata.encode_chunk_key(chunk))
-            if not file.exists():
-                raise FileError(
-                    f"{path}: lacks the chunk '{file}', which would be read as "
-                    f"{array.fill_value}: copy it again, or write chunks of one value too (of "
-                    "zarr: write_empty_chunks)"
-                )
+    """Read frames; the chunks of a file of hours may be removed meanwhile."""
+    _refuse_missing(path, array, place)
     return array[place]
+
+
+def _refuse_missing(path: Path, array: Any, place: tuple[int | slice, ...]) -> None:
+    """Refuse frames of which files of a Zarr array are missing: they are read as a fill value."""
+    folder, _ = split(path)
+    if folder.suffix.lower() not in ZARR:
+        return
+    ranges = [
+        range(n)[each] if isinstance(each, slice) else range(each, each + 1)
+        for each, n in zip(place, array.shape, strict=False)
+    ]
+    ranges += map(range, array.shape[len(place) :])
+    parts = [
+        range(each.start // side, math.ceil(each.stop / side))
+        for each, side in zip(ranges, array.shards or array.chunks, strict=True)
+    ]
+    for chunk in itertools.product(*parts):
+        file = _chunk_file(Path(folder, array.path), array, chunk)
+        if not file.exists():
+            raise FileError(
+                f"{path}: lacks the chunk '{file}', which would be read as {array.fill_value}: "
+                "copy it again, or write chunks of one value too (of zarr: write_empty_chunks)"
+            )
+
+
+def _chunk_file(folder: Path, array: Any, chunk: tuple[int, ...]) -> Path:
+    return Path(folder, array.metadata.encode_chunk_key(chunk))
 
 
 def chunk_frames(path: Path) -> int:
@@ -228,27 +234,31 @@ class ZarrFrames:
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def create(
+    def ensure(
         self, shape: tuple[int, int, int], dtype: np.dtype[Any], chunk: int, **texts: object
     ) -> None:
-        """Make an array of chunks of so many frames, with texts as its attributes."""
-        _zarr_library().create_array(
-            str(self.path),
-            shape=shape,
-            dtype=dtype,
-            chunks=(chunk, *shape[1:]),
-            attributes=texts,
-            overwrite=True,
-        )
+        """Make an array of chunks of so many frames, with texts as its attributes.
 
-    def exists(self, shape: tuple[int, int, int], dtype: np.dtype[Any], chunk: int) -> bool:
-        """Whether such an array is made."""
+        One that is there is kept with its chunks, unless its metadata are damaged.
+        """
+        zarr = _zarr_library()
+
+        def create(store: Any) -> Any:
+            return zarr.create_array(
+                store,
+                shape=shape,
+                dtype=dtype,
+                chunks=(chunk, *shape[1:]),
+                attributes=texts,
+                overwrite=True,
+            )
+
         try:
-            array = _zarr_library().open_array(str(self.path), mode="r")
-        except (OSError, ValueError, KeyError, TypeError):  # none, or a damaged one
-            return False
-        made = array.shape, array.dtype, array.chunks
-        return bool(made == (shape, dtype, (chunk, *shape[1:])))
+            found = zarr.open_array(str(self.path), mode="r").metadata
+        except (FileNotFoundError, ValueError, KeyError, TypeError):
+            found = None
+        if found != create({}).metadata:
+            create(str(self.path))
 
     def clean(self) -> None:
         """Remove what processes that were killed left of chunks they had begun."""
@@ -274,7 +284,7 @@ class ZarrFrames:
         return found.hexdigest()
 
     def _chunk(self, array: Any, start: int) -> Path:
-        return Path(self.path, array.metadata.encode_chunk_key((start // array.chunks[0], 0, 0)))
+        return _chunk_file(self.path, array, (start // array.chunks[0], 0, 0))
 
 
 @contextmanager

@@ -69,7 +69,9 @@ class WatchedFolder:
     _shapes: dict[Path, _Format] = field(default_factory=dict)
     _seen: dict[Path, tuple[State, float]] = field(default_factory=dict)
     _refused: dict[Path, State] = field(default_factory=dict)
-    _contents: dict[str, tuple[Path, tuple[float, float] | None]] = field(default_factory=dict)
+    _contents: dict[str, tuple[tuple[int, Path], tuple[float, float] | None]] = field(
+        default_factory=dict
+    )
     _reported: set[tuple[Path, str]] = field(default_factory=set)
 
     @property
@@ -113,11 +115,12 @@ class WatchedFolder:
         findings : list of Finding
             Files that are not used, each once for each reason.
         """
-        found = self._read_manifest()
+        told = self._read_manifest()
         files, waiting = self._files(), False
         new, begun = self._forget_changed(files), self._begun
-        # The older of two copies counts, also when a new process reads all files again.
-        for file, (position, state) in sorted(files.items(), key=lambda it: (it[1][1][1], it[0])):
+        refused: list[tuple[Path, str]] = []
+        for file in sorted(files, key=lambda each: _order(each, files[each][1])):
+            position, state = files[file]
             if state in (self._taken.get(file), self._refused.get(file)):
                 continue
             age = self._age(file, state)
@@ -127,18 +130,22 @@ class WatchedFolder:
             try:
                 kind = _format_of(file)
                 if state_of(file) == state:
-                    self._take(file, position, kind)
+                    self._take(file, state, position, kind)
                     self._taken[file], new = state, True
             except EquipixError as error:
                 # A file that is half written now is whole later.
                 if age >= _GIVEN_UP:
                     self._refused[file] = state
-                    found += self._finding(file, str(error))
-        if self._begun > begun:  # the first file was the odd one, and others were refused
+                    refused.append((file, str(error)))
+        if self._begun > begun:  # all anew: others count than those that were taken first
             self._refused.clear()
-            self._reported.clear()
-            return self.look()
-        return new, waiting, found
+            new, waiting, found = self.look()
+            return new, waiting, told + found
+        return (
+            new,
+            waiting,
+            told + [finding for each in refused for finding in self._finding(*each)],
+        )
 
     def _age(self, file: Path, state: State) -> float:
         """Seconds for which a file has not changed: clocks of two machines differ by some."""
@@ -149,13 +156,14 @@ class WatchedFolder:
             self._seen[file] = state, time.monotonic()
         return time.monotonic() - self._seen[file][1]
 
-    def _take(self, file: Path, position: tuple[float, float] | None, kind: _Format) -> None:
+    def _take(
+        self, file: Path, state: State, position: tuple[float, float] | None, kind: _Format
+    ) -> None:
         """Add the frames of a file; refuse them if most files have another format."""
         self._shapes[file] = kind
         wanted = Counter(self._shapes.values()).most_common(1)[0][0]
         if self._running is not None and self._wanted != wanted:
-            self._forget()
-            self._begun += 1
+            self._begin_again()
         if kind != wanted:
             raise FileError(
                 f"{file}: holds {kind[1]} frames of shape {kind[0]}, expected {wanted[1]} of shape "
@@ -163,13 +171,17 @@ class WatchedFolder:
             )
         if position is not None:
             check_reach(f"{file}: 'shift'", np.array(position), kind[0])
-        content = sha256_of([file])[file]
-        other, its = self._contents.get(content, (file, position))
-        if other != file and (position, its) != (None, None):  # a camera may show 0 in the dark
-            raise FileError(
-                f"{file}: is a copy of '{other.name}', expected frames of its own: take them "
-                "again, or remove one of the files"
-            )
+        # Of copies the oldest counts, whichever is seen first: so it is for a new process too.
+        content, order = sha256_of([file])[file], _order(file, state)
+        first, its = self._contents.get(content, (order, position))
+        if (position, its) != (None, None):  # a camera may show 0 in the dark
+            if order < first:
+                self._begin_again()
+            elif order > first:
+                raise FileError(
+                    f"{file}: is a copy of '{first[1]}', which counts, expected frames of its own: "
+                    "take them again, or remove one of the files"
+                )
         running, added = self._begin(kind[0]) if self._running is None else self._running, False
         try:
             for _, frames in stream_frames([file]):
@@ -182,7 +194,7 @@ class WatchedFolder:
                 self._refused = refused
             raise
         self._running, self._wanted = running, wanted
-        self._contents.setdefault(content, (file, position))
+        self._contents.setdefault(content, (order, position))
 
     def _begin(self, shape: tuple[int, ...]) -> Running:
         assert self._manifest is not None
@@ -195,20 +207,24 @@ class WatchedFolder:
             workers=self.workers,
         )
 
+    def _begin_again(self) -> None:
+        """Read all files once more, in their order."""
+        self._forget()
+        self._begun += 1
+
     def _forget(self) -> None:
         """Begin anew: sums do not give back what was added."""
         self._running, self._taken, self._refused, self._contents = None, {}, {}, {}
 
     def _forget_changed(self, files: dict[Path, tuple[Any, State]]) -> bool:
         """Begin anew where a file that was taken has changed or is gone."""
-        for file in [each for each in self._shapes if each not in files]:
-            del self._shapes[file]
-        kept = all(file in files and files[file][1] == was for file, was in self._taken.items())
-        if kept:
-            return False
-        self._forget()
-        self._shapes.clear()
-        return True
+        now = {file: state for file, (_, state) in files.items()}
+        changed = [file for file, was in self._taken.items() if now.get(file) != was]
+        for file in {*changed, *self._shapes.keys() - now.keys()}:
+            self._shapes.pop(file, None)
+        if changed:
+            self._forget()
+        return bool(changed)
 
     def _finding(self, file: Path, message: str) -> list[Finding]:
         """Say once why a file is not used."""
@@ -263,6 +279,11 @@ class WatchedFolder:
 def _place(exposure: Exposure) -> tuple[float, float]:
     """Position of an exposure; the origin unless it is given."""
     return place_of(exposure.shift or (0.0, 0.0))
+
+
+def _order(file: Path, state: State) -> tuple[int, Path]:
+    """Files are read in this order: the oldest first."""
+    return state[1], file
 
 
 def _existing(name: str, folder: Path) -> list[Path]:
