@@ -126,13 +126,15 @@ def _in_words(shown: dict[str, Any]) -> str:
         words.append(f"{shown['components']} parts that nothing compares")
     else:
         down, right = shown["tilt_std"]
-        drift = shown["rms_by_cause"]["drift"]
+        noise, dark, drift = (shown["rms_by_cause"][each] for each in ("noise", "dark", "drift"))
         known = "lamp drift not known yet" if drift != drift else f"lamp drift {drift:.1e}"
         words += [
             f"{shown['determined']:.1%} of the pixels determined",
-            f"expected error {shown['rms']:.2e} ({known})",
+            f"expected error {shown['rms']:.2e} (noise {noise:.1e}, dark {dark:.1e}, {known})",
             f"tilt ±{down:.1e}, ±{right:.1e} edge to edge (row, col)",
         ]
+        if dark > max(noise, 0.0 if drift != drift else drift):
+            words.append("more frames of the dark would help most")
     if shown["calibration_findings"]:
         words.append(f"findings: {', '.join(shown['calibration_findings'])}")
     if not shown["dark"]:

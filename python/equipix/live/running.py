@@ -65,12 +65,13 @@ class Estimate(Brief):
     determined : float
         Share of the pixels whose sensitivity is determined up to one common factor.
     rms : float
-        Expected root mean square of the relative error of M by noise and, where the positions show
-        it, by the drift of the lamp. Infinite with more than one part; NaN where the noise is not
-        known, as of one frame at each of too few positions.
+        Expected root mean square of the relative error of M by noise, by the noise and rounding of
+        the dark and, where the positions show it, by the drift of the lamp. Infinite with more than
+        one part; NaN where the noise is not known, as of one frame at each of too few positions.
     rms_by_cause : dict of str to float
-        The same for ``"noise"`` and ``"drift"`` alone. The drift is NaN where fewer than four
-        positions are known, or the fit is too far from its minimum, so that no residual shows it.
+        The same for ``"noise"``, ``"dark"`` and ``"drift"`` alone. The dark is 0 where there is
+        none. The drift is NaN where fewer than four positions are known, or the fit is too far from
+        its minimum, so that no residual shows it.
     tilt : tuple of float
         Standard deviation of the tilt of ln M, edge to edge (row, col), that noise and drift leave.
     calibration : Calibration or None
@@ -279,7 +280,9 @@ class Running:
         The calibration is that of `equipix.calibrate`, with a tolerance of 1e-4 and at most 60
         passes in each fit: its ``error_estimate`` says how far it is from the minimum. The expected
         error is that of `equipix.plan.error_budget`, with the noise and the drift that the frames
-        show; the tilt is that of fluxes known to the noise of a whole frame, and of the drift.
+        show. The error of the dark, common to all exposures, adds the variance v Σw / Σ(w S²) of a
+        pixel with signals S of weights w. The tilt is that of fluxes known to the noise of a whole
+        frame, and of the drift.
         """
         if self._estimate is None:
             if len(self._places) < 2:
@@ -317,11 +320,10 @@ class Running:
         positions = self.positions
         usual = np.maximum(np.ceil(_TRAVEL * np.array(self._shape)), np.ptp(positions, axis=0))
         travel = usual if max_shift is None else max_shift
-        noise, drift = math.nan, 0.0
         with warnings.catch_warnings(), naming_memory("planning"):
             warnings.simplefilter("ignore", EquipixWarning)
             found = self.estimate().calibration if len(positions) > 1 else None
-            noise, drift = self._noise_and_drift(found)
+            noise, dark, drift = self._causes(found)
             used = noise if noise > 0 else _USUAL_NOISE
             causes = {
                 "noise": used,
@@ -331,7 +333,8 @@ class Running:
             budget = error_budget(
                 self._shape, np.vstack([positions, best]), noise=used, drift=drift
             )
-        rms = math.inf if budget.components > 1 else budget.rms if noise > 0 else math.nan
+        known = math.hypot(budget.rms, dark) if noise > 0 else math.nan
+        rms = math.inf if budget.components > 1 else known
         row, col = best.tolist()
         return Needed((row, col), budget.components, rms)
 
@@ -353,7 +356,7 @@ class Running:
             components=1 if found is None else found.components,
             determined=1.0 if found is None else found.largest / math.prod(self._shape),
             rms=math.inf,
-            rms_by_cause={"noise": math.inf, "drift": math.nan},
+            rms_by_cause={"noise": math.inf, "dark": math.inf, "drift": math.nan},
             tilt=(math.inf, math.inf),
         )
         if known.components > 1:
@@ -365,7 +368,7 @@ class Running:
             calibration=calibration,
             determined=float(np.mean(usable(calibration.flags))),
         )
-        noise, drift = self._noise_and_drift(calibration)
+        noise, dark, drift = self._causes(calibration)
         if not noise > 0:
             return dataclasses.replace(known, rms=math.nan)
         budget = error_budget(self._shape, positions, noise=noise, drift=drift)
@@ -374,8 +377,8 @@ class Running:
         shown = math.nan if calibration.drift is None else budget.rms_by_cause["drift"]
         return dataclasses.replace(
             known,
-            rms=budget.rms,
-            rms_by_cause={"noise": budget.rms_by_cause["noise"], "drift": shown},
+            rms=math.hypot(budget.rms, dark),
+            rms_by_cause={"noise": budget.rms_by_cause["noise"], "dark": dark, "drift": shown},
             tilt=(row, col),
         )
 
@@ -402,8 +405,8 @@ class Running:
         self._averaged, self._reduced = averaged, counts
         return averaged
 
-    def _noise_and_drift(self, calibration: Calibration | None) -> tuple[float, float]:
-        """Noise of an exposure over its signal, NaN if unknown, and the drift of the lamp.
+    def _causes(self, calibration: Calibration | None) -> tuple[float, float, float]:
+        """Noise of an exposure over its signal, NaN if unknown; error of M by the dark; drift.
 
         Each pixel counts with the weight of its exposures: its noise is that of equal exposures
         which determine it as well. Of these the root mean square is taken.
@@ -414,15 +417,25 @@ class Running:
             alone = calibration.weighted.noise_variance
         else:
             measured, alone = self._measured or measured_of(self._reduce()), math.nan
-        weight = np.zeros(self._shape)
+        weights, information = np.zeros(self._shape), np.zeros(self._shape)
         for k, signal in enumerate(measured.values):
             variance = measured.variance_of(k, signal)
             variance = np.asarray(alone if variance is None else variance)
             seen = measured.usable(k) & (signal > 0)
-            weight += np.divide(signal**2, variance, where=seen, out=np.zeros(self._shape))
-        known = np.isfinite(weight) & (weight > 0)
-        noise = float(np.sqrt(len(measured) * np.mean(1 / weight[known]))) if known.any() else 0.0
-        return noise if noise > 0 else math.nan, 0.0 if drift is None else drift.size
+            weight = np.divide(1, variance, where=seen, out=np.zeros(self._shape))
+            weights += weight
+            information += weight * signal**2
+        known = np.isfinite(information) & (information > 0)
+        if calibration is not None:
+            known &= usable(calibration.flags)
+        if not known.any():
+            return math.nan, math.nan, 0.0
+        noise = float(np.sqrt(len(measured) * np.mean(1 / information[known])))
+        dark = 0.0
+        if measured.dark_variance is not None:
+            added = measured.dark_variance[known] * weights[known] / information[known]
+            dark = float(np.sqrt(np.mean(added)))
+        return noise if noise > 0 else math.nan, dark, 0.0 if drift is None else drift.size
 
 
 def place_of(position: ArrayLike) -> tuple[float, float]:
