@@ -121,7 +121,7 @@ def check_type(name: str, given: object, kind: type | tuple[type, ...], wanted: 
 def check_word(name: str, given: object, words: tuple[str, ...]) -> None:
     """Refuse what is none of some words."""
     if not (isinstance(given, str) and given in words):
-        raise InputError(f"'{name}' is {described(given)}, expected one of {words}")
+        raise InputError(f"'{name}' is {described(given)}, expected one of {', '.join(words)}")
 
 
 def described(given: object) -> str:

@@ -417,6 +417,15 @@ print(json.dumps(asdict(evaluate(job))))
     assert [*results.iterdir()] == []
 
 
+def test_an_input_that_the_system_refuses_is_the_reason_of_one_sensor(tmp_path):
+    path = write_levels(tmp_path / "a")
+    path.write_text(path.read_text().replace("1.tif", f"{'a' * 300}/1.tif"))
+    job = Job("a", path, tmp_path, ".tif", {}, LimitsFile(), False)
+    (row,) = import_module("equipix.batch.run")._rows([job], None, None, None)
+    assert row.status == "failed"
+    assert row.reason.endswith("/1.tif: cannot be read: File name too long")
+
+
 def test_a_sensor_has_no_name_of_the_lot(tmp_path):
     manifests = [write_levels(tmp_path / "lot"), write_levels(tmp_path / "other")]
     named = import_module("equipix.batch.run")._named
@@ -488,6 +497,14 @@ def test_what_cannot_be_a_lot_is_refused(lot, tmp_path, monkeypatch):
     monkeypatch.setattr("equipix.batch.cluster._TIMEOUT_S", 1)
     with pytest.raises(errors.EquipixError, match="cannot be reached"):
         batch.run(lot, output, scheduler="tcp://127.0.0.1:9")
+    with pytest.raises(errors.InputError, match="'order' is for other manifests than these"):
+        batch.run(lot[:2], output, order=2)
+    (tmp_path / "file").touch()
+    for each in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(errors.FileError, match=r"file: is a file, expected a folder"):
+            batch.run(lot, each)
+    with pytest.raises(errors.FileError, match=r"/proc/lot: cannot be written"):
+        batch.run(lot, "/proc")
     (output / "lot.html").mkdir(parents=True)
     with pytest.raises(errors.FileError, match=r"lot\.html: is a folder"):
         batch.run(lot, output)

@@ -112,12 +112,24 @@ class Row(Brief):
 
 def described_by(manifest: Path) -> Described:
     """Read a manifest of any kind."""
+    return type_of(manifest).load(manifest)
+
+
+def type_of(manifest: Path) -> type[Described]:
+    """Say what a manifest describes."""
     kinds: dict[str, type[Described]] = {
         "experiment": Experiment,
         "levels": LevelExperiment,
         "camera": CameraExperiment,
     }
-    return kinds[kind_of(manifest)].load(manifest)
+    return kinds[kind_of(manifest)]
+
+
+def options_of(kind: type[Described]) -> set[str]:
+    """Keywords of what evaluates a manifest of this kind."""
+    if issubclass(kind, CameraExperiment):
+        return set()
+    return set(signature(kind.run).parameters) - {"self", "mask", "workers", "progress"}
 
 
 def evaluate(job: Job, workers: int | None = None) -> Row:
@@ -135,14 +147,18 @@ def evaluate(job: Job, workers: int | None = None) -> Row:
         refuse_changed(states)
         found = replace(found, hashes=_hashes(job, found), seconds=time.monotonic() - started)
         _write(job, found)
-    except EquipixError as error:
-        return replace(row, reason=str(error), seconds=time.monotonic() - started)
     except Exception as error:
-        # One sensor must not stop the others, whatever is wrong with it.
-        LOG.exception("%s failed", job.name)
-        words = f"{type(error).__name__}: {error}"
-        return replace(row, reason=words, seconds=time.monotonic() - started)
+        reason, seconds = reason_of(job, error), time.monotonic() - started
+        return replace(row, reason=reason, seconds=seconds)
     return found
+
+
+def reason_of(job: Job, error: Exception) -> str:
+    """Why a sensor has no result: one must not stop the others, whatever is wrong with it."""
+    if isinstance(error, EquipixError):
+        return str(error)
+    LOG.error("%s failed", job.name, exc_info=error)
+    return f"{type(error).__name__}: {error}"
 
 
 def key_of(job: Job, described: Described) -> str:
@@ -233,7 +249,7 @@ def _evaluated(job: Job, described: Described, workers: int | None) -> Row:
         warnings.simplefilter("ignore", EquipixWarning)
         if isinstance(described, CameraExperiment):
             return _camera(job, described, workers)
-        known = signature(described.run).parameters
+        known = options_of(type(described))
         options = {name: value for name, value in job.options.items() if name in known}
         result = described.run(workers=workers, **options)
     output, report = job.path(job.suffix), job.path(".html")

@@ -3,15 +3,23 @@
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields
-from inspect import signature
-from itertools import chain
 from os import PathLike
 from pathlib import Path
 from typing import Any, get_args
 
 from equipix._check import LOG, FluxModel, Progress, check_type, check_word, positive_workers
 from equipix.batch.cluster import LOCAL, Task, finished
-from equipix.batch.evaluation import Job, Row, described_by, evaluate, kept, refuse_taken
+from equipix.batch.evaluation import (
+    Job,
+    Row,
+    described_by,
+    evaluate,
+    kept,
+    options_of,
+    reason_of,
+    refuse_taken,
+    type_of,
+)
 from equipix.batch.lot import LOT, Lot, refuse_no_table
 from equipix.batch.memory import bytes_needed
 from equipix.errors import EquipixError, FileError, InputError
@@ -19,13 +27,11 @@ from equipix.experiment.experiment import Experiment
 from equipix.experiment.level_experiment import LevelExperiment
 from equipix.exposures.exposures import FitOptions
 from equipix.io.formats import SUFFIXES
-from equipix.io.paths import as_path
+from equipix.io.paths import as_path, folder_beside
 from equipix.nuc.order import check_order
 from equipix.report.limits import read_limits
 
-_OPTIONS = set(
-    chain(signature(Experiment.run).parameters, signature(LevelExperiment.run).parameters)
-) - {"self", "mask", "workers", "progress"}
+_OPTIONS = options_of(Experiment) | options_of(LevelExperiment)
 
 
 def run(
@@ -106,6 +112,7 @@ def run(
         Job(name, manifest, folder, suffix, options, wanted, partial)
         for name, manifest in _named([as_path("manifests", each) for each in manifests]).items()
     ]
+    _refuse_idle(options, jobs)
     for job in jobs:
         refuse_taken(job)
     refuse_no_table(folder)
@@ -129,6 +136,18 @@ def _check_options(options: Mapping[str, Any]) -> None:
     check_order(options.get("order", 1), options.get("by", "offset"))
 
 
+def _refuse_idle(options: Mapping[str, Any], jobs: list[Job]) -> None:
+    """Refuse an option that none of the manifests takes."""
+    try:
+        kinds = {type_of(job.manifest) for job in jobs}
+    except EquipixError:
+        return  # a row will say what is wrong with the manifest
+    taken = {name for kind in kinds for name in options_of(kind)}
+    for name in options:
+        if name not in taken:
+            raise InputError(f"'{name}' is for other manifests than these: leave it out")
+
+
 def _named(manifests: list[Path]) -> dict[str, Path]:
     """Manifests by short names: that of the folder, with that of the file where needed."""
     files = [file.resolve() for file in manifests]
@@ -145,10 +164,12 @@ def _named(manifests: list[Path]) -> dict[str, Path]:
 
 
 def _refuse_as_output(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileError(f"'{folder}' cannot be the folder of results: {error.strerror}") from error
+    """Make the folder of results; refuse one that cannot be made or written to."""
+    for place in (folder, *folder.parents):
+        if place.exists() and not place.is_dir():
+            raise FileError(f"{place}: is a file, expected a folder for the results")
+    with folder_beside(folder / LOT):  # made first
+        pass
 
 
 def _rows(
@@ -168,9 +189,9 @@ def _rows(
                 yield before
             else:
                 tasks.append(Task(job, bytes_needed(described, job.options)))
-        except EquipixError as error:
+        except Exception as error:
             done += 1
-            yield Row(job.name, str(job.manifest), reason=str(error))
+            yield Row(job.name, str(job.manifest), reason=reason_of(job, error))
     for task, found in finished(evaluate, tasks, scheduler, workers):
         done += 1
         if progress is not None:

@@ -54,9 +54,13 @@ def _matches(name: str | PathLike[str], folder: Path) -> list[Path]:
     given = as_path("frames", name)
     path = folder / given
     file, _ = split(path)
-    if file.is_dir() and file.suffix.lower() not in ZARR:
+    try:
+        is_folder, exists = file.is_dir(), file.exists()
+    except OSError as error:  # such as of a closed folder
+        raise FileError(f"{path}: cannot be read: {error.strerror}") from error
+    if is_folder and file.suffix.lower() not in ZARR:
         raise FileError(f"{path}: is a folder, expected files: name them by a glob, {path}/*.tif")
-    if file.exists():
+    if exists:
         return [path]
     pattern, place = split(given)
     if not glob.has_magic(str(pattern)):

@@ -10,6 +10,7 @@ use super::descent::{Descent, Pull};
 use super::method::{Frame, Method};
 use super::moved::{Move, Own, difference, transposed};
 use super::options::check_range;
+use super::saturation::any_at;
 use super::shift::PhaseCorrelation;
 use super::spectrum::{Spectrum, Transform};
 use super::spline::prefilter;
@@ -206,11 +207,16 @@ fn fill_parts(
         let lines = own.chunks_mut(cols).zip(other.chunks_mut(cols)).enumerate();
         for (line, (own, other)) in lines {
             let row = index * BAND + line;
-            for col in 0..cols {
-                let inside = rows.contains(&row) && columns.contains(&col);
-                let used = inside && !left_out.is_some_and(|out| out[row * cols + col]);
-                own[col] = if used { 1.0 } else { 0.0 };
-                other[col] = down[row] * across[col];
+            own.fill(0.0);
+            if rows.contains(&row) {
+                own[columns.clone()].fill(1.0);
+            }
+            if let Some(out) = left_out {
+                let pixels = own.iter_mut().zip(&out[row * cols..]);
+                pixels.filter(|(_, out)| **out).for_each(|(part, _)| *part = 0.0);
+            }
+            for (part, across) in other.iter_mut().zip(&across) {
+                *part = down[row] * across;
             }
         }
     });
@@ -220,7 +226,7 @@ fn fill_parts(
 /// such a pixel; none if there is no such pixel.
 fn saturated(frame: &Frame<'_>, before: &[f32], way: &Move) -> Option<Vec<bool>> {
     let earlier = |y: &f32| *y >= frame.saturation;
-    if frame.left_out.is_none() && !before.iter().any(earlier) {
+    if frame.left_out.is_none() && !any_at(before, frame.saturation) {
         return None;
     }
     let mut found: Vec<bool> = frame.raw.iter().map(earlier).collect();

@@ -1,6 +1,6 @@
 //! Saturated pixels, which do not learn.
 
-use super::bands::BAND;
+use super::bands::{BAND, wide};
 use super::neighbourhood::Squares;
 use crate::frames::Shape;
 use crate::parallel::Workers;
@@ -8,6 +8,14 @@ use crate::parallel::Workers;
 /// Share of saturated pixels in a neighbourhood above which its mean is not used. One pixel that is always
 /// saturated is less than this in 3×3, and leaves its neighbours to learn.
 const MOST: f32 = 0.125;
+
+wide! {
+/// Whether a value is at a level or above it: without a branch for each value.
+pub(super) fn any_at<'s>(values: &'s [f32], level: f32) -> bool {
+    const AT_ONCE: usize = 1024;
+    values.chunks(AT_ONCE).any(|part| part.iter().fold(false, |found, y| found | (*y >= level)))
+}
+}
 
 /// The pixels that are saturated, if `own`, or have too many such pixels in their neighbourhood; none if no pixel is.
 pub(super) fn left_out(
@@ -17,7 +25,7 @@ pub(super) fn left_out(
     (width, own): (usize, bool),
     workers: &Workers,
 ) -> Option<Vec<bool>> {
-    if !saturation.is_finite() || !raw.iter().any(|y| *y >= saturation) {
+    if !saturation.is_finite() || !any_at(raw, saturation) {
         return None;
     }
     let (cols, mut found) = (shape.cols, vec![false; shape.len()]);

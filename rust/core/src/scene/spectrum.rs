@@ -11,30 +11,37 @@ use super::bands::wide;
 use crate::frames::Shape;
 use crate::parallel::Workers;
 
-/// Rows of the image that a thread transforms at a time.
-const LINES: usize = 8;
+/// Frequencies along the columns, and rows or frequencies along the rows, of which sums are taken at a time:
+/// their sums stay in registers. Of 8 rows they do not, and it takes five times as long.
+const TILE: usize = 16;
+const LINES: usize = 4;
 
-/// Factors of one axis: frequency · place about the centre, for places of the first half.
+/// Factors of one axis, for N frequencies at a time.
 #[derive(Debug)]
-struct Axis {
+struct Axis<const N: usize> {
     size: usize,
     /// Number of frequencies 0, 1, … over the size.
     count: usize,
-    /// cos and sin, `count` of each for every place.
-    cos: Vec<f32>,
-    sin: Vec<f32>,
+    /// cos and sin of frequency · place about the centre, for places of the first half: all those of N
+    /// frequencies, then of the next N.
+    cos: Vec<[f32; N]>,
+    sin: Vec<[f32; N]>,
     /// Hann window at each place.
     window: Vec<f32>,
 }
 
-impl Axis {
+impl<const N: usize> Axis<N> {
     fn new(size: usize, cutoff: f64) -> Self {
         let count = (cutoff * size as f64).ceil() as usize;
+        let half = size.div_ceil(2);
         let angles = |function: fn(f64) -> f64| {
-            let half = size.div_ceil(2);
             let place = |i: usize| i as f64 - (size as f64 - 1.0) / 2.0;
             let angle = move |i: usize, k: usize| 2.0 * PI * k as f64 / size as f64 * place(i);
-            (0..half * count).map(|i| function(angle(i / count, i % count)) as f32).collect()
+            let factors = |i: usize| {
+                let first = i / half * N;
+                std::array::from_fn(|each| function(angle(i % half, first + each)) as f32)
+            };
+            (0..count.div_ceil(N) * half).map(factors).collect()
         };
         let window = |i: usize| (PI * (i as f64 + 0.5) / size as f64).sin().powi(2) as f32;
         let window = (0..size).map(window).collect();
@@ -50,14 +57,25 @@ impl Axis {
     fn half(&self) -> usize {
         self.size.div_ceil(2)
     }
+
+    /// How many times N frequencies there are, the last of which may be beyond the count.
+    fn blocks(&self) -> usize {
+        self.count.div_ceil(N)
+    }
+
+    /// cos and sin of N frequencies at the places of the first half.
+    fn block(&self, index: usize) -> [&[[f32; N]]; 2] {
+        let places = index * self.half()..(index + 1) * self.half();
+        [&self.cos[places.clone()], &self.sin[places]]
+    }
 }
 
 /// The transform of images of one shape.
 #[derive(Debug)]
 pub(super) struct Transform {
     shape: Shape,
-    rows: Axis,
-    cols: Axis,
+    rows: Axis<LINES>,
+    cols: Axis<TILE>,
 }
 
 /// Amplitudes at the frequencies (k, l), k from −K to K along the rows, l from 0 to L along the columns,
@@ -66,6 +84,16 @@ pub(super) struct Transform {
 pub(super) struct Spectrum {
     pub(super) re: Vec<f32>,
     pub(super) im: Vec<f32>,
+}
+
+/// Sums over places of frequencies along the columns, of rows or frequencies along the rows.
+type Sums = [[f32; TILE]; LINES];
+
+/// Rows of amplitudes of a frequency k along the rows, and those of −k.
+#[derive(Default)]
+struct Lines {
+    plus: Spectrum,
+    minus: Spectrum,
 }
 
 impl Transform {
@@ -88,95 +116,117 @@ impl Transform {
 
     /// Amplitudes of an image under a Hann window, less its mean.
     pub(super) fn of(&self, image: &[f32], mean: f32, workers: &Workers) -> Spectrum {
-        let count = self.cols.count;
-        // A row of amplitudes: count real parts, then as many imaginary ones.
-        let mut lines = vec![0.0_f32; self.shape.rows * 2 * count];
-        workers.map_blocks(&mut lines, LINES * 2 * count, |index, lines| {
+        // A row of amplitudes: real parts of all frequencies, then the imaginary ones.
+        let width = 2 * self.cols.blocks();
+        let mut lines = vec![[0.0_f32; TILE]; self.shape.rows * width];
+        workers.map_blocks(&mut lines, LINES * width, |index, lines| {
             along_cols(self, image, mean, index * LINES, lines);
         });
-        let found = workers.map(self.rows.count, |k| along_rows(self, &lines, k));
+        let folded = workers.map(width, |tile| self.folded(&lines, tile));
+        let found = workers.map(self.rows.blocks(), |block| along_rows(self, &folded, block));
+        let found: Vec<_> = found.into_iter().flatten().take(self.rows.count).collect();
         let mut spectrum = Spectrum::default();
-        let negative = found[1..].iter().rev().map(|[_, minus]| minus);
-        for values in negative.chain(found.iter().map(|[plus, _]| plus)) {
-            let (re, im) = values.split_at(count);
-            spectrum.re.extend_from_slice(re);
-            spectrum.im.extend_from_slice(im);
+        let negative = found[1..].iter().rev().map(|lines| &lines.minus);
+        for each in negative.chain(found.iter().map(|lines| &lines.plus)) {
+            spectrum.re.extend_from_slice(&each.re[..self.cols.count]);
+            spectrum.im.extend_from_slice(&each.im[..self.cols.count]);
         }
         spectrum
     }
 
     /// Transforms some rows: Σ v exp(−iθ) over the columns.
     #[inline(always)]
-    fn along_cols(&self, image: &[f32], mean: f32, first: usize, lines: &mut [f32]) {
+    fn along_cols(&self, image: &[f32], mean: f32, first: usize, lines: &mut [[f32; TILE]]) {
         let (axis, cols) = (&self.cols, self.shape.cols);
-        for (row, line) in lines.chunks_mut(2 * axis.count).enumerate() {
+        let (mut even, mut odd) =
+            (vec![[0.0_f32; LINES]; axis.half()], vec![[0.0_f32; LINES]; axis.half()]);
+        for row in 0..lines.len() / (2 * axis.blocks()) {
             let values = &image[(first + row) * cols..(first + row + 1) * cols];
-            let (re, im) = line.split_at_mut(axis.count);
             let weight = self.rows.window[first + row];
             for place in 0..axis.half() {
                 let one = weight * axis.window[place] * (values[place] - mean);
                 let other = axis
                     .opposite(place)
                     .map_or(0.0, |other| weight * axis.window[other] * (values[other] - mean));
-                let (even, odd) = (one + other, one - other);
-                let start = place * axis.count;
-                let (cos, sin) = (&axis.cos[start..], &axis.sin[start..]);
-                for (re, cos) in re.iter_mut().zip(cos) {
-                    *re += even * cos;
-                }
-                for (im, sin) in im.iter_mut().zip(sin) {
-                    *im -= odd * sin;
-                }
+                even[place][row] = one + other;
+                odd[place][row] = one - other;
+            }
+        }
+        for tile in 0..axis.blocks() {
+            let [cos, sin] = axis.block(tile);
+            let (re, im) = (sums(&even, cos), sums(&odd, sin));
+            for (row, line) in lines.chunks_mut(2 * axis.blocks()).enumerate() {
+                line[tile] = re[row];
+                line[axis.blocks() + tile] = im[row].map(|value| -value);
             }
         }
     }
 
-    /// Amplitudes at the frequencies k and −k along the rows: real parts, then imaginary ones.
+    /// Sums and differences of opposite rows, for frequencies of one tile.
+    fn folded(&self, lines: &[[f32; TILE]], tile: usize) -> [Vec<[f32; TILE]>; 2] {
+        let (axis, width) = (&self.rows, 2 * self.cols.blocks());
+        let row = |place: usize| &lines[place * width + tile];
+        let pairs = (0..axis.half()).map(|place| {
+            let one = row(place);
+            let other = axis.opposite(place).map_or(&[0.0; TILE], row);
+            let both = |of: fn(f32, f32) -> f32| std::array::from_fn(|i| of(one[i], other[i]));
+            (both(|one, other| one + other), both(|one, other| one - other))
+        });
+        let (even, odd) = pairs.unzip();
+        [even, odd]
+    }
+
+    /// Amplitudes at some frequencies k and −k along the rows: even ∓ i odd.
     #[inline(always)]
-    fn along_rows(&self, lines: &[f32], k: usize) -> [Vec<f32>; 2] {
-        let (axis, width) = (&self.rows, 2 * self.cols.count);
-        let (mut even, mut odd) = (vec![0.0_f32; width], vec![0.0_f32; width]);
-        for place in 0..axis.half() {
-            let [cos, sin] = [&axis.cos, &axis.sin].map(|table| table[place * axis.count + k]);
-            let one = &lines[place * width..(place + 1) * width];
-            match axis.opposite(place) {
-                Some(other) => {
-                    let other = &lines[other * width..(other + 1) * width];
-                    for i in 0..width {
-                        even[i] += cos * (one[i] + other[i]);
-                        odd[i] += sin * (one[i] - other[i]);
-                    }
-                }
-                None => {
-                    for i in 0..width {
-                        even[i] += cos * one[i];
-                        odd[i] += sin * one[i];
-                    }
+    fn along_rows(&self, folded: &[[Vec<[f32; TILE]>; 2]], block: usize) -> [Lines; LINES] {
+        let [cos, sin] = self.rows.block(block);
+        let (real, imaginary) = folded.split_at(self.cols.blocks());
+        let mut found: [Lines; LINES] = std::array::from_fn(|_| Lines::default());
+        for ([even, odd], [even_im, odd_im]) in real.iter().zip(imaginary) {
+            let [re, im] = [sums(cos, even), sums(cos, even_im)];
+            let [turned_re, turned_im] = [sums(sin, odd_im), sums(sin, odd)];
+            for (k, Lines { plus, minus }) in found.iter_mut().enumerate() {
+                for i in 0..TILE {
+                    plus.re.push(re[k][i] + turned_re[k][i]);
+                    plus.im.push(im[k][i] - turned_im[k][i]);
+                    minus.re.push(re[k][i] - turned_re[k][i]);
+                    minus.im.push(im[k][i] + turned_im[k][i]);
                 }
             }
         }
-        // even ∓ i odd.
-        let count = self.cols.count;
-        [1.0, -1.0].map(|sign: f32| {
-            let turn = |i: usize| {
-                if i < count { sign * odd[i + count] } else { -sign * odd[i - count] }
-            };
-            (0..width).map(|i| even[i] + turn(i)).collect()
-        })
+        found
     }
+}
+
+/// Σ part · factor over places, of each part and each factor.
+#[inline(always)]
+fn sums(parts: &[[f32; LINES]], factors: &[[f32; TILE]]) -> Sums {
+    let mut sums = [[0.0; TILE]; LINES];
+    for (parts, factors) in parts.iter().zip(factors) {
+        for line in 0..LINES {
+            for i in 0..TILE {
+                sums[line][i] += parts[line] * factors[i];
+            }
+        }
+    }
+    sums
 }
 
 wide! {
 /// [`Transform::along_cols`].
-fn along_cols<'s>(by: &'s Transform, image: &'s [f32], mean: f32, first: usize, lines: &'s mut [f32]) -> () {
+fn along_cols<'s>(
+    by: &'s Transform, image: &'s [f32], mean: f32, first: usize, lines: &'s mut [[f32; TILE]],
+) -> () {
     by.along_cols(image, mean, first, lines);
 }
 }
 
 wide! {
 /// [`Transform::along_rows`].
-fn along_rows<'s>(by: &'s Transform, lines: &'s [f32], k: usize) -> [Vec<f32>; 2] {
-    by.along_rows(lines, k)
+fn along_rows<'s>(
+    by: &'s Transform, folded: &'s [[Vec<[f32; TILE]>; 2]], block: usize,
+) -> [Lines; LINES] {
+    by.along_rows(folded, block)
 }
 }
 

@@ -97,34 +97,50 @@ fn filter_lines<'s>(values: &'s [f32], lines: &'s mut [f32], cols: usize) -> () 
 wide! {
 /// Filters the columns of a band of rows.
 fn filter_band<'s>(shape: Shape, along: &'s [f32], first: usize, band: &'s mut [f32]) -> () {
-    let cols = shape.cols;
-    let rows = band.len() / cols + 2 * REACH;
-    let mut wide = vec![[0.0_f32; STRIP]; rows];
-    for start in (0..cols).step_by(STRIP) {
-        let width = STRIP.min(cols - start);
-        let mut last = [0.0_f32; STRIP];
-        for (i, line) in wide.iter_mut().enumerate() {
-            let row = mirrored((first + i) as isize - REACH as isize, shape.rows);
-            let values = &along[row * cols + start..][..width];
-            for (last, value) in last.iter_mut().zip(values) {
-                *last = value + POLE * *last;
-            }
-            *line = last;
-        }
-        last = [0.0; STRIP];
-        for (i, line) in wide.iter().enumerate().rev() {
-            for (last, value) in last.iter_mut().zip(line) {
-                *last = POLE * (*last - value);
-            }
-            if i >= REACH && i < rows - REACH {
-                let values = &mut band[(i - REACH) * cols + start..][..width];
-                for (value, last) in values.iter_mut().zip(&last) {
-                    *value = 6.0 * last;
-                }
-            }
+    let mut wide = vec![[0.0_f32; STRIP]; band.len() / shape.cols + 2 * REACH];
+    for start in (0..shape.cols).step_by(STRIP) {
+        // Of a constant width, so that a row of the strip is some registers.
+        if start + STRIP <= shape.cols {
+            filter_strip(shape, along, first, band, &mut wide, (start, STRIP));
+        } else {
+            filter_strip(shape, along, first, band, &mut wide, (start, shape.cols - start));
         }
     }
 }
+}
+
+/// Filters the columns from `start` on of a band of rows.
+#[inline(always)]
+fn filter_strip(
+    shape: Shape,
+    along: &[f32],
+    first: usize,
+    band: &mut [f32],
+    wide: &mut [[f32; STRIP]],
+    (start, width): (usize, usize),
+) {
+    let (cols, rows) = (shape.cols, wide.len());
+    let mut last = [0.0_f32; STRIP];
+    for (i, line) in wide.iter_mut().enumerate() {
+        let row = mirrored((first + i) as isize - REACH as isize, shape.rows);
+        let values = &along[row * cols + start..][..width];
+        for (last, value) in last.iter_mut().zip(values) {
+            *last = value + POLE * *last;
+        }
+        *line = last;
+    }
+    last = [0.0; STRIP];
+    for (i, line) in wide.iter().enumerate().rev() {
+        for (last, value) in last.iter_mut().zip(line) {
+            *last = POLE * (*last - value);
+        }
+        if i >= REACH && i < rows - REACH {
+            let values = &mut band[(i - REACH) * cols + start..][..width];
+            for (value, last) in values.iter_mut().zip(&last) {
+                *value = 6.0 * last;
+            }
+        }
+    }
 }
 
 /// Multiplies the first and the last row by a factor, then the first and the last column.
