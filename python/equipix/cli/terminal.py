@@ -169,6 +169,8 @@ def check_output(
         raise FileError(f"'{path}' is a {kind}, expected the name of a {wanted}")
     if path.exists() and not force:
         raise FileError(f"'{path}' exists: name another output, or replace it with --force")
+    if path.parent.is_file():
+        raise FileError(f"'{path}' cannot be written: '{path.parent}' is a file, no folder")
     if not path.parent.is_dir():
         raise FileError(f"'{path}' cannot be written: there is no folder '{path.parent}'")
     if not os.access(path.parent, os.W_OK):

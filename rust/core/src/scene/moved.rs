@@ -276,22 +276,25 @@ mod tests {
 
     #[test]
     fn the_spline_goes_through_the_values_and_moves_them_by_whole_pixels() {
-        let shape = Shape::new(75, 37);
-        let values = image(shape);
-        for shift in [[0_isize, 0], [3, -2], [-5, 4]] {
-            let (result, way) = moved(shape, &values, shift.map(|shift| shift as f64));
-            let [rows, cols] = way.inside;
-            assert_eq!(
-                rows.len() * cols.len(),
-                (75 - shift[0].unsigned_abs()) * (37 - shift[1].unsigned_abs())
-            );
-            for row in rows {
-                for col in cols.clone() {
-                    let from =
-                        row.strict_add_signed(shift[0]) * 37 + col.strict_add_signed(shift[1]);
-                    // Filters of gain (6/(4 − 2))² = 9 at most, of some ten additions, values below 2.
-                    let error = result[row * 37 + col] - values[from];
-                    assert!(error.abs() < 200.0 * f32::EPSILON, "{error}");
+        // Narrower than a strip of columns, and two strips with a rest.
+        for width in [37, 150] {
+            let shape = Shape::new(75, width);
+            let values = image(shape);
+            for shift in [[0_isize, 0], [3, -2], [-5, 4]] {
+                let (result, way) = moved(shape, &values, shift.map(|shift| shift as f64));
+                let [rows, cols] = way.inside;
+                assert_eq!(
+                    rows.len() * cols.len(),
+                    (75 - shift[0].unsigned_abs()) * (width - shift[1].unsigned_abs())
+                );
+                for row in rows {
+                    for col in cols.clone() {
+                        let from = row.strict_add_signed(shift[0]) * width
+                            + col.strict_add_signed(shift[1]);
+                        // Filters of gain (6/(4 − 2))² = 9 at most, of some ten additions, values below 2.
+                        let error = result[row * width + col] - values[from];
+                        assert!(error.abs() < 200.0 * f32::EPSILON, "{error}");
+                    }
                 }
             }
         }

@@ -236,27 +236,35 @@ mod tests {
 
     #[test]
     fn amplitudes_are_the_direct_sums() {
-        let shape = Shape::new(31, 48);
+        // Frequencies that fill a part of a tile, and several with a rest; sizes odd and even.
+        check(Shape::new(31, 48), 0.1, [7, 5]);
+        check(Shape::new(44, 73), 0.4, [35, 30]);
+    }
+
+    fn check(shape: Shape, cutoff: f64, sizes: [usize; 2]) {
         let image: Vec<f32> = (0..shape.len()).map(|i| ((i * 7919) % 1009) as f32 / 1e3).collect();
-        let transform = Transform::new(shape, 0.1);
+        let transform = Transform::new(shape, cutoff);
         let workers = Workers::new(std::num::NonZeroUsize::new(2)).unwrap();
         let mean = 0.5_f32;
         let spectrum = transform.of(&image, mean, &workers);
-        let [lines, cols] = transform.sizes();
-        assert_eq!([lines, cols], [7, 5]);
+        assert_eq!(transform.sizes(), sizes);
         let window = |i: usize, size: usize| (PI * (i as f64 + 0.5) / size as f64).sin().powi(2);
-        for entry in 0..lines * cols {
+        let centre = |size: usize| (size as f64 - 1.0) / 2.0;
+        for entry in 0..sizes[0] * sizes[1] {
             let [u, v] = transform.frequency(entry);
             let mut wanted = [0.0; 2];
             for (i, value) in image.iter().enumerate() {
-                let (row, col) = (i / 48, i % 48);
-                let value = window(row, 31) * window(col, 48) * f64::from(value - mean);
-                let angle = u * (row as f64 - 15.0) + v * (col as f64 - 23.5);
+                let (row, col) = (i / shape.cols, i % shape.cols);
+                let value =
+                    window(row, shape.rows) * window(col, shape.cols) * f64::from(value - mean);
+                let angle =
+                    u * (row as f64 - centre(shape.rows)) + v * (col as f64 - centre(shape.cols));
                 wanted[0] += value * angle.cos();
                 wanted[1] -= value * angle.sin();
             }
-            // Rounding of 31 + 48 additions that reach some 100.
-            let allowed = 100.0 * 80.0 * f64::from(f32::EPSILON);
+            // Rounding of as many additions as rows and columns, that reach some 100.
+            let additions = (shape.rows + shape.cols) as f64;
+            let allowed = 100.0 * additions * f64::from(f32::EPSILON);
             assert!((f64::from(spectrum.re[entry]) - wanted[0]).abs() < allowed, "{entry}");
             assert!((f64::from(spectrum.im[entry]) - wanted[1]).abs() < allowed, "{entry}");
         }
