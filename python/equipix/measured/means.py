@@ -174,7 +174,7 @@ class Averaged:
     def with_room(self, count: int) -> Self:
         """Return a copy with room for `count` exposures, those of this one among them."""
         grown = copy.copy(self)
-        for known in ("noise", "filters", "_dark_points", "_beside_least"):
+        for known in ("noise", "filters"):  # of all exposures; what is known of the darks stands
             vars(grown).pop(known, None)
         grown.count = count
         for name, kept in vars(self).items():
