@@ -304,12 +304,14 @@ def test_it_warns_once_where_no_worker_has_the_memory_for_long(monkeypatch, larg
     looks = iter(largest)
 
     class Left:
+        """The last future ends together with the last look; who takes it has nothing left then."""
+
         def is_empty(self):
-            return not looks.__length_hint__()
+            return not sent
 
         def next_batch(self, *, block):
             assert not block
-            return []
+            return [] if looks.__length_hint__() else ["one"]
 
     def declared(_):
         found = next(looks)
@@ -323,7 +325,9 @@ def test_it_warns_once_where_no_worker_has_the_memory_for_long(monkeypatch, larg
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         sent = {"one": Task(None, 3), "other": Task(None, 7)}
-        assert not [*cluster_of_dask._ended(None, Left(), sent)]
+        for future in cluster_of_dask._ended(None, Left(), sent):
+            assert future == "one"
+            sent.clear()
     assert len(said) == warned
 
 
@@ -420,10 +424,11 @@ print(json.dumps(asdict(evaluate(job))))
 def test_an_input_that_the_system_refuses_is_the_reason_of_one_sensor(tmp_path):
     path = write_levels(tmp_path / "a")
     path.write_text(path.read_text().replace("1.tif", f"{'a' * 300}/1.tif"))
-    job = Job("a", path, tmp_path, ".tif", {}, LimitsFile(), False)
-    (row,) = import_module("equipix.batch.run")._rows([job], None, None, None)
-    assert row.status == "failed"
-    assert row.reason.endswith("/1.tif: cannot be read: File name too long")
+    lot = batch.run([path], tmp_path / "results", order=1)
+    assert [row.status for row in lot.rows] == ["failed"]
+    assert lot.rows[0].reason.endswith("/1.tif: cannot be read: File name too long")
+    lot = batch.run([tmp_path / ("b" * 300) / "levels.toml"], tmp_path / "results", order=1)
+    assert "File name too long" in lot.rows[0].reason
 
 
 def test_a_sensor_has_no_name_of_the_lot(tmp_path):
@@ -497,7 +502,7 @@ def test_what_cannot_be_a_lot_is_refused(lot, tmp_path, monkeypatch):
     monkeypatch.setattr("equipix.batch.cluster._TIMEOUT_S", 1)
     with pytest.raises(errors.EquipixError, match="cannot be reached"):
         batch.run(lot, output, scheduler="tcp://127.0.0.1:9")
-    with pytest.raises(errors.InputError, match="'order' is for other manifests than these"):
+    with pytest.raises(errors.InputError, match=r"'order' is no option of experiment\.toml"):
         batch.run(lot[:2], output, order=2)
     (tmp_path / "file").touch()
     for each in (tmp_path / "file", tmp_path / "file" / "below"):

@@ -350,6 +350,20 @@ def test_a_piece_that_was_damaged_is_made_again(tmp_path, correction, monkeypatc
     assert files_in(tmp_path / "one.zarr") == files_in(output)
 
 
+def test_pieces_are_kept_where_a_dark_has_another_name(tmp_path, correction, monkeypatch):
+    names, output = zarr(tmp_path, frames_of("uint16")), tmp_path / "out.zarr"
+    dark, moved = tmp_path / "dark.npy", tmp_path / "moved.npy"
+    np.save(dark, np.full((2, *SHAPE), 100, np.uint16))
+    monkeypatch.setattr(recordings, "_total", lambda _: (_ for _ in ()).throw(errors.FileError))
+    with pytest.raises(errors.FileError):
+        batch.correct(correction, names, output, scheduler=None, dark=[str(dark)])
+    monkeypatch.undo()
+    dark.rename(moved)
+    monkeypatch.setattr(recordings, "_corrected", lambda *_: pytest.fail("made again"))
+    batch.correct(correction, names, output, scheduler=None, dark=[str(moved)])
+    assert "moved.npy" in (output / "zarr.json").read_text()
+
+
 def test_a_disk_that_fails_for_a_moment_costs_no_piece(tmp_path, correction, monkeypatch):
     zarrs = pytest.importorskip("zarr")
     names, output = zarr(tmp_path, frames_of("uint16")), tmp_path / "out.zarr"

@@ -117,6 +117,17 @@ def test_errors_that_are_expected_occur(count: int) -> None:
     assert estimate.determined == 1
 
 
+def test_pixels_that_one_exposure_saturates_count_in_what_is_expected() -> None:
+    dark, frames = frames_of(SHAPE, SHIFTS, count=8)
+    whole = running_of(dark, frames, SHIFTS).estimate()
+    # Each exposure saturates where the others do not: all pixels have one less, 6/5 the variance.
+    for k, each in enumerate(frames):
+        each[:, k :: len(SHIFTS)] = 4095
+    estimate = running_of(dark, frames, SHIFTS).estimate()
+    ratio = estimate.rms_by_cause["noise"] / whole.rms_by_cause["noise"]
+    assert ratio == pytest.approx(np.sqrt(6 / 5), rel=0.02)
+
+
 @pytest.mark.parametrize(
     ("darks", "read", "level"), [(1, 15.0, 4095), (2, 15.0, 4095), (64, 0.07, 255)]
 )

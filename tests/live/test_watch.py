@@ -142,8 +142,9 @@ def test_of_copies_the_oldest_counts(tmp_path: Path, of: str, copy: str, later: 
     files[1].write_bytes(files[0].read_bytes())
     os.utime(files[1], ns=(files[0].stat().st_mtime_ns + later * 10**9,) * 2)
     counting, refused = sorted(files, key=lambda file: (file.stat().st_mtime_ns, file))
-    for each in (found, watched(tmp_path)):
-        _, _, (finding,) = each.look()
+    for each in (found, WatchedFolder(tmp_path, found.path)):
+        new, _, (finding,) = each.look()
+        assert new == (each is not found or counting == files[1])
         assert finding.message.startswith(f"{refused}: is a copy of '{counting}', which counts")
         frames = [file for file in tmp_path.glob("p*.tif") if file != refused]
         assert counts(each) == tuple(

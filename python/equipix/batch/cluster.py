@@ -117,7 +117,7 @@ def _ended(client: Any, left: Any, sent: dict[Any, Task]) -> Iterator[Any]:
     while not left.is_empty():
         yield from left.next_batch(block=False)
         time.sleep(_POLL_S)
-        if time.monotonic() - asked < _TIMEOUT_S / 2:
+        if not sent or time.monotonic() - asked < _TIMEOUT_S / 2:
             continue
         asked = time.monotonic()
         least = min(task.memory for task in sent.values())

@@ -27,7 +27,7 @@ from equipix.experiment.experiment import Experiment
 from equipix.experiment.level_experiment import LevelExperiment
 from equipix.exposures.exposures import FitOptions
 from equipix.io.formats import SUFFIXES
-from equipix.io.paths import as_path, folder_beside
+from equipix.io.paths import as_path, folder_beside, writing
 from equipix.nuc.order import check_order
 from equipix.report.limits import read_limits
 
@@ -95,8 +95,9 @@ def run(
     result, then a page, then ``NAME.json``, each whole or not at all. A sensor whose JSON file has
     the hash of its inputs, options, limits and version, and the hashes of its result and its page,
     is kept as it is: a lot that was interrupted goes on where it was. Nothing but rows travels
-    through the scheduler. A worker takes a sensor when the memory for it is free. Where all workers
-    are gone, an `InputWarning` says so within a minute, and the lot waits for others. Dask logs
+    through the scheduler. A worker takes a sensor when the memory for it is free. Where no
+    worker has the memory for any that waits, an `InputWarning` says so within a minute, and the lot
+    waits for others. Dask logs
     nothing in this process meanwhile.
     """
     if unknown := sorted(set(options) - _OPTIONS):
@@ -138,14 +139,15 @@ def _check_options(options: Mapping[str, Any]) -> None:
 
 def _refuse_idle(options: Mapping[str, Any], jobs: list[Job]) -> None:
     """Refuse an option that none of the manifests takes."""
+    if not options:
+        return
     try:
         kinds = {type_of(job.manifest) for job in jobs}
-    except EquipixError:
+    except (EquipixError, OSError):
         return  # a row will say what is wrong with the manifest
-    taken = {name for kind in kinds for name in options_of(kind)}
-    for name in options:
-        if name not in taken:
-            raise InputError(f"'{name}' is for other manifests than these: leave it out")
+    if idle := sorted(options.keys() - {name for kind in kinds for name in options_of(kind)}):
+        names = ", ".join(sorted({job.manifest.name for job in jobs}))
+        raise InputError(f"'{idle[0]}' is no option of {names}: leave it out")
 
 
 def _named(manifests: list[Path]) -> dict[str, Path]:
@@ -165,11 +167,12 @@ def _named(manifests: list[Path]) -> dict[str, Path]:
 
 def _refuse_as_output(folder: Path) -> None:
     """Make the folder of results; refuse one that cannot be made or written to."""
-    for place in (folder, *folder.parents):
-        if place.exists() and not place.is_dir():
-            raise FileError(f"{place}: is a file, expected a folder for the results")
-    with folder_beside(folder / LOT):  # made first
-        pass
+    with writing(folder):
+        for place in (folder, *folder.parents):
+            if place.exists() and not place.is_dir():
+                raise FileError(f"{place}: is a file, expected a folder for the results")
+        with folder_beside(folder / LOT):  # made first
+            pass
 
 
 def _rows(

@@ -134,7 +134,9 @@ def _in_words(shown: dict[str, Any]) -> str:
             f"tilt ±{down:.1e}, ±{right:.1e} edge to edge (row, col)",
         ]
         if dark > max(noise, 0.0 if drift != drift else drift):
-            words.append("more frames of the dark would help most")
+            words.append(
+                "the dark limits most: take more of its frames, if their noise is above 1 DN"
+            )
     if shown["calibration_findings"]:
         words.append(f"findings: {', '.join(shown['calibration_findings'])}")
     if not shown["dark"]:

@@ -239,7 +239,8 @@ class ZarrFrames:
     ) -> None:
         """Make an array of chunks of so many frames, with texts as its attributes.
 
-        One that is there is kept with its chunks, unless its metadata are damaged.
+        One that is there is kept with its chunks, unless its metadata are damaged. Texts are those
+        of the last call: files may have other names.
         """
         zarr = _zarr_library()
 
@@ -253,12 +254,17 @@ class ZarrFrames:
                 overwrite=True,
             )
 
+        def layout(array: Any) -> dict[str, Any]:
+            return {**array.metadata.to_dict(), "attributes": {}}
+
         try:
-            found = zarr.open_array(str(self.path), mode="r").metadata
+            array = zarr.open_array(str(self.path), mode="r+")
         except (FileNotFoundError, ValueError, KeyError, TypeError):
-            found = None
-        if found != create({}).metadata:
+            array = None
+        if array is None or layout(array) != layout(create({})):
             create(str(self.path))
+        elif array.attrs.asdict() != texts:
+            array.attrs.put(texts)
 
     def clean(self) -> None:
         """Remove what processes that were killed left of chunks they had begun."""

@@ -139,8 +139,8 @@ class WatchedFolder:
                     refused.append((file, str(error)))
         if self._begun > begun:  # all anew: others count than those that were taken first
             self._refused.clear()
-            new, waiting, found = self.look()
-            return new, waiting, told + found
+            _, waiting, found = self.look()
+            return True, waiting, told + found
         return (
             new,
             waiting,

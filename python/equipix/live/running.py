@@ -370,7 +370,8 @@ class Running:
         )
         noise, dark, drift = self._causes(calibration)
         if not noise > 0:
-            return dataclasses.replace(known, rms=math.nan)
+            causes = {"noise": math.nan, "dark": dark, "drift": math.nan}
+            return dataclasses.replace(known, rms=math.nan, rms_by_cause=causes)
         budget = error_budget(self._shape, positions, noise=noise, drift=drift)
         flux_std = math.hypot(drift, noise / math.sqrt(known.determined * math.prod(self._shape)))
         row, col = tilt_of_fluxes(self._shape, positions, flux_std).tolist()
@@ -411,7 +412,8 @@ class Running:
         Each pixel counts with the weight of its exposures: its noise is that of equal exposures
         which determine it as well. Of these the root mean square is taken.
         """
-        drift = calibration.drift if calibration is not None else None
+        found = None if calibration is None else calibration.drift
+        drift = 0.0 if found is None else found.size
         if calibration is not None and calibration.weighted is not None:
             measured: Measured = calibration.weighted.exposures
             alone = calibration.weighted.noise_variance
@@ -424,18 +426,18 @@ class Running:
             seen = measured.usable(k) & (signal > 0)
             weight = np.divide(1, variance, where=seen, out=np.zeros(self._shape))
             weights += weight
-            information += weight * signal**2
+            information += np.multiply(weight, signal**2, where=seen, out=np.zeros(self._shape))
         known = np.isfinite(information) & (information > 0)
         if calibration is not None:
             known &= usable(calibration.flags)
         if not known.any():
-            return math.nan, math.nan, 0.0
+            return math.nan, math.nan, drift
         noise = float(np.sqrt(len(measured) * np.mean(1 / information[known])))
         dark = 0.0
         if measured.dark_variance is not None:
             added = measured.dark_variance[known] * weights[known] / information[known]
             dark = float(np.sqrt(np.mean(added)))
-        return noise if noise > 0 else math.nan, dark, 0.0 if drift is None else drift.size
+        return noise if noise > 0 else math.nan, dark, drift
 
 
 def place_of(position: ArrayLike) -> tuple[float, float]:
