@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields
 from os import PathLike
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any, get_args
 
 from equipix._check import LOG, FluxModel, Progress, check_type, check_word, positive_workers
@@ -27,7 +28,7 @@ from equipix.experiment.experiment import Experiment
 from equipix.experiment.level_experiment import LevelExperiment
 from equipix.exposures.exposures import FitOptions
 from equipix.io.formats import SUFFIXES
-from equipix.io.paths import as_path, folder_beside, writing
+from equipix.io.paths import as_path, writing
 from equipix.nuc.order import check_order
 from equipix.report.limits import read_limits
 
@@ -171,8 +172,8 @@ def _refuse_as_output(folder: Path) -> None:
         for place in (folder, *folder.parents):
             if place.exists() and not place.is_dir():
                 raise FileError(f"{place}: is a file, expected a folder for the results")
-        with folder_beside(folder / LOT):  # made first
-            pass
+        folder.mkdir(parents=True, exist_ok=True)
+        TemporaryFile(dir=folder).close()
 
 
 def _rows(
