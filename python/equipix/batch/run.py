@@ -96,10 +96,9 @@ def run(
     result, then a page, then ``NAME.json``, each whole or not at all. A sensor whose JSON file has
     the hash of its inputs, options, limits and version, and the hashes of its result and its page,
     is kept as it is: a lot that was interrupted goes on where it was. Nothing but rows travels
-    through the scheduler. A worker takes a sensor when the memory for it is free. Where no
-    worker has the memory for any that waits, an `InputWarning` says so within a minute, and the lot
-    waits for others. Dask logs
-    nothing in this process meanwhile.
+    through the scheduler. A worker takes a sensor when the memory for it is free. Where no worker
+    has the memory for any that waits, an `InputWarning` says so within a minute, and the lot waits
+    for others. Dask logs nothing in this process meanwhile.
     """
     if unknown := sorted(set(options) - _OPTIONS):
         known = ", ".join(sorted(_OPTIONS))

@@ -141,11 +141,9 @@ class WatchedFolder:
             self._refused.clear()
             _, waiting, found = self.look()
             return True, waiting, told + found
-        return (
-            new,
-            waiting,
-            told + [finding for each in refused for finding in self._finding(*each)],
-        )
+        for each in refused:
+            told += self._finding(*each)
+        return new, waiting, told
 
     def _age(self, file: Path, state: State) -> float:
         """Seconds for which a file has not changed: clocks of two machines differ by some."""
