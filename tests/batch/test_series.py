@@ -359,9 +359,12 @@ def test_pieces_are_kept_where_a_dark_has_another_name(tmp_path, correction, mon
         batch.correct(correction, names, output, scheduler=None, dark=[str(dark)])
     monkeypatch.undo()
     dark.rename(moved)
-    monkeypatch.setattr(recordings, "_corrected", lambda *_: pytest.fail("made again"))
-    batch.correct(correction, names, output, scheduler=None, dark=[str(moved)])
+    with monkeypatch.context() as patched:
+        patched.setattr(recordings, "_corrected", lambda *_: pytest.fail("made again"))
+        batch.correct(correction, names, output, scheduler=None, dark=[str(moved)])
+    batch.correct(correction, names, tmp_path / "one.zarr", scheduler=None, dark=[str(moved)])
     assert "moved.npy" in (output / "zarr.json").read_text()
+    assert files_in(tmp_path / "one.zarr") == files_in(output)
 
 
 def test_a_disk_that_fails_for_a_moment_costs_no_piece(tmp_path, correction, monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -294,6 +295,22 @@ def test_a_killed_process_goes_on_and_ends_where_the_accuracy_is_met(tmp_path: P
     assert (last["met"], last["next"]) == (True, None)
     assert last["rms"] <= 6e-3
     assert last["positions"][1] == {"exposure": "p1", "shift": [0.0, 11.0]}
+
+
+def test_it_says_where_the_dark_limits_most(tmp_path: Path) -> None:
+    found = watched(tmp_path)
+    all_frames(tmp_path)
+    found.look()
+    assert found.running is not None
+    shown, _ = _shown(found, found.running, None, None)
+    for (noise, dark, drift), limits in {
+        (1e-3, 2e-3, math.nan): True,
+        (3e-3, 2e-3, math.nan): False,
+        (1e-3, 2e-3, 3e-3): False,
+        (1e-3, 2e-3, 1e-3): True,
+    }.items():
+        shown["rms_by_cause"] = {"noise": noise, "dark": dark, "drift": drift}
+        assert ("the dark limits most" in _in_words(shown)) == limits
 
 
 def test_the_dark_is_waited_for(tmp_path: Path) -> None:

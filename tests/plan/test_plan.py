@@ -548,6 +548,28 @@ class TestBudget:
         with pytest.warns(IdentifiabilityWarning, match="do not constrain a wave"):
             budget_of((64, 80), 2.5 * equipix.cross_pattern(1, 3), noise=1)
 
+    @pytest.mark.parametrize(
+        "shifts",
+        [
+            pytest.param([(0, 0), (0, 0.4), (0.3, 0), (0.2, 0.1)], id="less than a pixel apart"),
+            pytest.param([(0, 0), (0, 2.3), (2.1, 0), (4.2, 6.4)], id="even but for fractions"),
+        ],
+    )
+    def test_noise_is_not_known_where_whole_shifts_compare_too_little(self, shifts):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", IdentifiabilityWarning)
+            budget = budget_of((64, 80), shifts, noise=1)
+        (said,) = (each for each in budget.findings if each.kind == "noise")
+        assert "the error by noise is not known" in said.message
+        assert np.isnan([budget.rms, budget.rms_by_cause["noise"]]).all()
+        assert budget.components == 1
+
+    def test_noise_is_known_where_whole_shifts_leave_corners_alone(self):
+        far = np.array([(0, 20), (6, 13), (11, 9), (15, 4), (20, 0)])
+        assert plan.identify((64, 80), far).components > 1
+        between = budget_of((64, 80), far + 0.2 * np.eye(5, 2), noise=1)
+        assert 0 < between.rms < np.inf
+
     def test_of_parts_that_nothing_compares(self):
         with pytest.warns(IdentifiabilityWarning, match="4 parts"):
             budget = budget_of((80, 100), equipix.cross_pattern(4, 6), noise=1)

@@ -15,7 +15,7 @@ from equipix._check import Array
 from equipix.batch.evaluation import Row
 from equipix.errors import EquipixError, FileError
 from equipix.findings import Finding, Findings, Flag, Severity
-from equipix.io.paths import write_whole
+from equipix.io.paths import write_whole, writing
 from equipix.report.figures import name_of
 from equipix.report.maps import Map
 from equipix.report.page import Part, Table, drawn, mapped, page, write_page
@@ -246,9 +246,10 @@ def _draw(name: str, values: list[float | None], axes: Any) -> None:
 
 def refuse_no_table(folder: Path) -> None:
     """Refuse to begin where the table could not be written in the end."""
-    for suffix in (".csv", ".parquet", ".html"):
-        if (taken := folder / f"{LOT}{suffix}").is_dir():
-            raise FileError(f"{taken}: is a folder, expected a file: name another output")
+    with writing(folder):
+        for suffix in (".csv", ".parquet", ".html"):
+            if (taken := folder / f"{LOT}{suffix}").is_dir():
+                raise FileError(f"{taken}: is a folder, expected a file: name another output")
     _refuse_no_parquet()
 
 

@@ -1,5 +1,6 @@
 """All manifests of a lot, on the workers of a cluster."""
 
+import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields
@@ -142,17 +143,17 @@ def _refuse_idle(options: Mapping[str, Any], jobs: list[Job]) -> None:
     if not options:
         return
     try:
-        kinds = {type_of(job.manifest) for job in jobs}
+        kinds = {type_of(job.manifest): job.manifest.name for job in jobs}
     except (EquipixError, OSError):
         return  # a row will say what is wrong with the manifest
     if idle := sorted(options.keys() - {name for kind in kinds for name in options_of(kind)}):
-        names = ", ".join(sorted({job.manifest.name for job in jobs}))
+        names = ", ".join(sorted(kinds.values()))  # one manifest of each kind
         raise InputError(f"'{idle[0]}' is no option of {names}: leave it out")
 
 
 def _named(manifests: list[Path]) -> dict[str, Path]:
     """Manifests by short names: that of the folder, with that of the file where needed."""
-    files = [file.resolve() for file in manifests]
+    files = [Path(os.path.realpath(file)) for file in manifests]  # resolve() refuses loops of links
     if not files:
         raise InputError("'manifests' is empty: name the experiment.toml of each sensor")
     if twice := [str(file) for file, count in Counter(files).items() if count > 1]:
@@ -172,7 +173,8 @@ def _refuse_as_output(folder: Path) -> None:
             if place.exists() and not place.is_dir():
                 raise FileError(f"{place}: is a file, expected a folder for the results")
         folder.mkdir(parents=True, exist_ok=True)
-        TemporaryFile(dir=folder).close()
+        # Hidden, where the system has no files without a name; nothing to clean up after a kill.
+        TemporaryFile(dir=folder, prefix=".").close()
 
 
 def _rows(

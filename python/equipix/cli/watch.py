@@ -135,7 +135,8 @@ def _in_words(shown: dict[str, Any]) -> str:
         ]
         if dark > max(noise, 0.0 if drift != drift else drift):
             words.append(
-                "the dark limits most: take more of its frames, if their noise is above 1 DN"
+                "the dark limits most: more of its frames help if their noise is above a third of "
+                "the ADC's step"
             )
     if shown["calibration_findings"]:
         words.append(f"findings: {', '.join(shown['calibration_findings'])}")

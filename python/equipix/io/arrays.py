@@ -239,8 +239,8 @@ class ZarrFrames:
     ) -> None:
         """Make an array of chunks of so many frames, with texts as its attributes.
 
-        One that is there is kept with its chunks, unless its metadata are damaged. Texts are those
-        of the last call: files may have other names.
+        One that is there is kept with its chunks, unless its metadata are damaged. The texts are
+        written anew: a dark may have been renamed since.
         """
         zarr = _zarr_library()
 

@@ -67,13 +67,15 @@ class Estimate(Brief):
     rms : float
         Expected root mean square of the relative error of M by noise, by the noise and rounding of
         the dark and, where the positions show it, by the drift of the lamp. Infinite with more than
-        one part; NaN where the noise is not known, as of one frame at each of too few positions.
+        one part; NaN where the noise is not known, as of one frame at each of too few positions, or
+        where its effect is not (see `equipix.plan.error_budget`).
     rms_by_cause : dict of str to float
-        The same for ``"noise"``, ``"dark"`` and ``"drift"`` alone. The dark is 0 where there is
-        none. The drift is NaN where fewer than four positions are known, or the fit is too far from
-        its minimum, so that no residual shows it.
+        The same for ``"noise"``, ``"dark"`` and ``"drift"`` alone; NaN where `rms` is. The dark is
+        0 where there is none. The drift is NaN also where fewer than four positions are known, or
+        the fit is too far from its minimum, so that no residual shows it.
     tilt : tuple of float
         Standard deviation of the tilt of ln M, edge to edge (row, col), that noise and drift leave.
+        NaN where the noise is not known.
     calibration : Calibration or None
         The result so far; None with more than one part.
     """
@@ -371,7 +373,8 @@ class Running:
         noise, dark, drift = self._causes(calibration)
         if not noise > 0:
             causes = {"noise": math.nan, "dark": dark, "drift": math.nan}
-            return dataclasses.replace(known, rms=math.nan, rms_by_cause=causes)
+            unknown = (math.nan, math.nan)
+            return dataclasses.replace(known, rms=math.nan, rms_by_cause=causes, tilt=unknown)
         budget = error_budget(self._shape, positions, noise=noise, drift=drift)
         flux_std = math.hypot(drift, noise / math.sqrt(known.determined * math.prod(self._shape)))
         row, col = tilt_of_fluxes(self._shape, positions, flux_std).tolist()
@@ -410,10 +413,11 @@ class Running:
         """Noise of an exposure over its signal, NaN if unknown; error of M by the dark; drift.
 
         Each pixel counts with the weight of its exposures: its noise is that of equal exposures
-        which determine it as well. Of these the root mean square is taken.
+        which determine it as well. Of these the root mean square is taken. That fewer exposures
+        compare a pixel with fewer others is not counted.
         """
-        found = None if calibration is None else calibration.drift
-        drift = 0.0 if found is None else found.size
+        shown = None if calibration is None else calibration.drift
+        drift = 0.0 if shown is None else shown.size
         if calibration is not None and calibration.weighted is not None:
             measured: Measured = calibration.weighted.exposures
             alone = calibration.weighted.noise_variance
@@ -423,7 +427,8 @@ class Running:
         for k, signal in enumerate(measured.values):
             variance = measured.variance_of(k, signal)
             variance = np.asarray(alone if variance is None else variance)
-            seen = measured.usable(k) & (signal > 0)
+            # Equal frames have no noise: what they tell of it is unknown, not endless.
+            seen = measured.usable(k) & (signal > 0) & (variance != 0)
             weight = np.divide(1, variance, where=seen, out=np.zeros(self._shape))
             weights += weight
             information += np.multiply(weight, signal**2, where=seen, out=np.zeros(self._shape))
@@ -431,7 +436,7 @@ class Running:
         if calibration is not None:
             known &= usable(calibration.flags)
         if not known.any():
-            return math.nan, math.nan, drift
+            return math.nan, 0.0 if measured.dark_variance is None else math.nan, drift
         noise = float(np.sqrt(len(measured) * np.mean(1 / information[known])))
         dark = 0.0
         if measured.dark_variance is not None:

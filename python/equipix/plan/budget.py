@@ -114,7 +114,8 @@ def error_budget(
     shifts : array_like, shape (n, 2)
         Position (row, col) of the sensor in the beam in each exposure, in pixels; at least two.
         Fractions of a pixel count for drift, errors of shifts and the spectrum; noise is that of
-        the nearest whole shifts, which a calibration between pixels has too.
+        the nearest whole shifts, which a calibration between pixels has too. Its effect is not
+        known, NaN, where these compare at most half of the sensor, as shifts below one pixel do.
     noise : float
         Standard deviation of the random noise of an exposure's mean, the same in every pixel, as
         a share of the signal in the middle of the beam at flux 1.
@@ -178,10 +179,12 @@ def error_budget(
     positions = whole_moves(exact)
     waves = pattern_errors.spectrum(exact, powers)
     # Between pixels no part of the sensor is unconnected: each is compared with parts of cells.
-    parts = identify(sizes, positions).components
-    components = 1 if between_pixels(exact) else parts
+    parts = identify(sizes, positions)
+    components = 1 if between_pixels(exact) else parts.components
     local = LocalVariance(sizes, positions, powers, beam_width)
-    by_noise = noise * np.sqrt(pattern_errors.factor(sizes, positions, powers) * local.mean)
+    by_noise = np.nan
+    if components > 1 or 2 * parts.largest > np.prod(sizes):
+        by_noise = noise * np.sqrt(pattern_errors.factor(sizes, positions, powers) * local.mean)
     drifted = tilt_of_fluxes(sizes, exact, drift)
     along_rows, along_cols = drifted.tolist()
     moved, tilt = pattern_errors.shift_error_effect(sizes, exact, powers, beam_width, shift_error)
@@ -252,6 +255,16 @@ def _on_components(budget: ErrorBudget) -> str | None:
     )
 
 
+def _on_noise(budget: ErrorBudget) -> str | None:
+    """Say that nothing predicts the effect of noise."""
+    if not np.isnan(budget.rms_by_cause["noise"]):
+        return None
+    return (
+        "rounded to whole pixels, the shifts leave most of the sensor unconnected: between pixels "
+        "the error by noise is not known then: choose other shifts (equipix.plan.suggest)"
+    )
+
+
 def _on_line(budget: ErrorBudget) -> str | None:
     """Say that shifts along one line leave a tilt undetermined, whatever the lamp's drift."""
     if np.isfinite(budget.rms_by_cause["drift"]):
@@ -291,6 +304,7 @@ def _on_drift(budget: ErrorBudget) -> str | None:
 _RULES: tuple[Rule[ErrorBudget], ...] = (
     Rule("pattern", "identifiability", _on_wave),
     Rule("components", "identifiability", _on_components),
+    Rule("noise", "identifiability", _on_noise),
     Rule("tilt", "identifiability", _on_line, unless=frozenset({"components"})),
     Rule("beam", "identifiability", _on_beam),
     Rule("drift", "misfit", _on_drift),
