@@ -272,8 +272,9 @@ def draw_plans(budgets: list[ErrorBudget]) -> Figure:
     rows = figure.subplots(len(budgets), 4, squeeze=False, width_ratios=(1, 1.5, 1.3, 0.9))
     shown = [_thinned_noise(budget) for budget in budgets]
     finite = np.concatenate([values[np.isfinite(values)] for values, _ in shown])
-    limits = (float(finite.min()), float(finite.max()))
-    largest = max(max(b.rms_by_cause.values()) for b in budgets if np.isfinite(b.rms))
+    limits = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+    heights = np.array([[*each.rms_by_cause.values()] for each in budgets])
+    largest = np.max(heights, where=np.isfinite(heights), initial=0.0) or 1.0
     for row, budget, (values, step) in zip(rows, budgets, shown, strict=True):
         _positions(row[0], budget)
         _spectrum(row[1], budget)
@@ -321,8 +322,9 @@ def _spectrum(axes: Axes, budget: ErrorBudget) -> None:
 
 
 def _causes(axes: Axes, budget: ErrorBudget, limit: float) -> None:
-    """Draw a bar for each cause of error."""
+    """Draw a bar for each cause of error; one without end, or not known, has its label alone."""
     names = [name.replace("_", "\n") for name in budget.rms_by_cause]
-    bars = axes.bar(names, list(budget.rms_by_cause.values()), color=("C0", "C1", "C2"))
-    axes.bar_label(bars, fmt="%.1e", fontsize="small")
+    values = np.array([*budget.rms_by_cause.values()])
+    bars = axes.bar(names, np.where(np.isfinite(values), values, 0), color=("C0", "C1", "C2"))
+    axes.bar_label(bars, [f"{value:.1e}" for value in values], fontsize="small")
     axes.set(title="rms error of M by cause", ylim=(0, limit))

@@ -766,6 +766,13 @@ class TestPlan:
         assert err.startswith("equipix: warning: lamp drift will tilt")
         assert picture.stat().st_size > 0
 
+    @pytest.mark.filterwarnings("error::RuntimeWarning")
+    @pytest.mark.parametrize("shifts", ["0,0 0,0", "0,0 0,5", "0,0 0.4,0.5 0.5,0 0.1,0.5"])
+    def test_draws_errors_that_are_infinite_or_not_known(self, run, tmp_path, shifts):
+        picture = tmp_path / "plan.png"
+        status, *_ = run("plan", "--shape", 64, 80, "--shifts", shifts, "-o", picture)
+        assert (status, picture.exists()) == (0, True)
+
     def test_as_json(self, run):
         status, out, _ = run("plan", "--shape", 64, 80, "--shifts", "0,0 0,4 0,6 4,0 6,0", "--json")
         assert status == 0
