@@ -158,14 +158,20 @@ def test_no_accuracy_is_met_where_the_effect_of_noise_is_not_known() -> None:
     estimate = running.estimate()
     assert estimate.components == 1
     assert math.isnan(estimate.rms)
-    assert not estimate.meets(1)
+    assert math.isnan(running.needed().rms)
 
 
 @pytest.mark.parametrize(
-    ("darks", "read", "level"), [(1, 15.0, 4095), (2, 15.0, 4095), (64, 0.07, 255)]
+    ("darks", "read", "level", "count"),
+    [
+        pytest.param(1, 15.0, 4095, 64, id="one frame of the dark"),
+        pytest.param(2, 15.0, 4095, 64, id="two frames of the dark"),
+        pytest.param(64, 0.07, 255, 64, id="less noise than a step"),
+        pytest.param(1, 15.0, 4095, 1, id="single frames that show no noise"),
+        pytest.param(2, 15.0, 4095, 1, id="single frames, two of the dark"),
+    ],
 )
-def test_the_error_of_the_dark_counts(darks: int, read: float, level: int) -> None:
-    """That of few dark frames, and of rounding where they have less noise than a step."""
+def test_the_error_of_the_dark_counts(darks: int, read: float, level: int, count: int) -> None:
     rng = np.random.default_rng(9)
     pedestal = 0.06 * level + rng.random(SHAPE)
     light = signals(SHAPE, SHIFTS, 0.8 * level)
@@ -175,7 +181,7 @@ def test_the_error_of_the_dark_counts(darks: int, read: float, level: int) -> No
         noise = deviation * rng.standard_normal((count, *SHAPE))
         return np.clip(np.rint(pedestal + signal + noise), 0, level).astype(np.uint16)
 
-    frames = [shot(each, 64) for each in light]
+    frames = [shot(each, count) for each in light]
     dark = shot(np.zeros(SHAPE), darks)
     if level == 255:
         dark, frames = dark.astype(np.uint8), [each.astype(np.uint8) for each in frames]
@@ -187,12 +193,13 @@ def test_the_error_of_the_dark_counts(darks: int, read: float, level: int) -> No
     assert estimate.calibration is not None
     error = np.nanstd(estimate.calibration.sensitivity / truth_of(SHAPE) - 1)
     causes = estimate.rms_by_cause
-    # The dark is most of it. As above; the pattern is known, but rounding of 0.07 DN is not normal.
-    assert causes["dark"] > 2 * causes["noise"]
+    # Of many frames the dark is most of it, of single ones a fifth of the variance or more. As
+    # above; the pattern is known, but rounding of 0.07 DN is not normal.
+    assert causes["dark"] > (2 if count > 1 else 0.5) * causes["noise"]
     assert error == pytest.approx(estimate.rms, rel=0.12)
     assert running.needed().rms > causes["dark"]
     assert estimate.meets(1.2 * estimate.rms)
-    assert not estimate.meets(2 * causes["noise"])
+    assert not estimate.meets(1.1 * causes["noise"])
 
 
 @pytest.mark.long

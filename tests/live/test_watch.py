@@ -311,6 +311,10 @@ def test_it_says_where_the_dark_limits_most(tmp_path: Path) -> None:
     }.items():
         shown["rms_by_cause"] = {"noise": noise, "dark": dark, "drift": drift}
         assert ("the dark limits most" in _in_words(shown)) == limits
+    shown["rms"] = math.nan
+    shown["next"]["rms"] = math.nan
+    assert "expected error not known" in _in_words(shown)
+    assert "nan" not in _in_words(shown)
 
 
 def test_the_dark_is_waited_for(tmp_path: Path) -> None:

@@ -147,7 +147,7 @@ def _refuse_idle(options: Mapping[str, Any], jobs: list[Job]) -> None:
     except (EquipixError, OSError):
         return  # a row will say what is wrong with the manifest
     if idle := sorted(options.keys() - {name for kind in kinds for name in options_of(kind)}):
-        names = ", ".join(sorted(kinds.values()))  # one manifest of each kind
+        names = ", ".join(sorted(set(kinds.values())))  # one manifest of each kind
         raise InputError(f"'{idle[0]}' is no option of {names}: leave it out")
 
 
@@ -173,7 +173,7 @@ def _refuse_as_output(folder: Path) -> None:
             if place.exists() and not place.is_dir():
                 raise FileError(f"{place}: is a file, expected a folder for the results")
         folder.mkdir(parents=True, exist_ok=True)
-        # Hidden, where the system has no files without a name; nothing to clean up after a kill.
+        # Without a name, so that a kill leaves nothing; hidden where the system has no such files.
         TemporaryFile(dir=folder, prefix=".").close()
 
 

@@ -1,5 +1,6 @@
 """The command watch: what frames determine while the camera writes them."""
 
+import math
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -125,19 +126,7 @@ def _in_words(shown: dict[str, Any]) -> str:
     elif shown["components"] > 1:
         words.append(f"{shown['components']} parts that nothing compares")
     else:
-        down, right = shown["tilt_std"]
-        noise, dark, drift = (shown["rms_by_cause"][each] for each in ("noise", "dark", "drift"))
-        known = "lamp drift not known yet" if drift != drift else f"lamp drift {drift:.1e}"
-        words += [
-            f"{shown['determined']:.1%} of the pixels determined",
-            f"expected error {shown['rms']:.2e} (noise {noise:.1e}, dark {dark:.1e}, {known})",
-            f"tilt ±{down:.1e}, ±{right:.1e} edge to edge (row, col)",
-        ]
-        if dark > max(noise, 0.0 if drift != drift else drift):
-            words.append(
-                "the dark limits most: more of its frames help if their noise is above a third of "
-                "the ADC's step"
-            )
+        words += [f"{shown['determined']:.1%} of the pixels determined", *_error_in_words(shown)]
     if shown["calibration_findings"]:
         words.append(f"findings: {', '.join(shown['calibration_findings'])}")
     if not shown["dark"]:
@@ -147,6 +136,26 @@ def _in_words(shown: dict[str, Any]) -> str:
     if shown["next"] is not None:
         row, col = shown["next"]["shift"]
         parts, rms = shown["next"]["components"], shown["next"]["rms"]
-        gives = f"{parts} parts" if parts > 1 else f"error {rms:.2e}"
+        known = "error not known" if math.isnan(rms) else f"error {rms:.2e}"
+        gives = f"{parts} parts" if parts > 1 else known
         words.append(f"next ({row:g}, {col:g}): {gives}")
     return "; ".join(words)
+
+
+def _error_in_words(shown: dict[str, Any]) -> list[str]:
+    """Write the expected error with its causes, or that it is not known."""
+    if math.isnan(shown["rms"]):
+        return ["expected error not known: take more frames, at positions a pixel or more apart"]
+    noise, dark, drift = (shown["rms_by_cause"][each] for each in ("noise", "dark", "drift"))
+    known = "lamp drift not known yet" if math.isnan(drift) else f"lamp drift {drift:.1e}"
+    down, right = shown["tilt_std"]
+    words = [
+        f"expected error {shown['rms']:.2e} (noise {noise:.1e}, dark {dark:.1e}, {known})",
+        f"tilt ±{down:.1e}, ±{right:.1e} edge to edge (row, col)",
+    ]
+    if dark > max(noise, 0.0 if math.isnan(drift) else drift):
+        words.append(
+            "the dark limits most: more of its frames help if their noise is above a third of the "
+            "ADC's step"
+        )
+    return words

@@ -29,7 +29,7 @@ from equipix.findings import Findings, usable
 from equipix.fitting.weighted import Options
 from equipix.measured.average import RunningAverage
 from equipix.measured.colour import Colours
-from equipix.measured.means import Averaged
+from equipix.measured.means import Averaged, variance_of_dark_alone
 from equipix.measured.measured import Measured, measured_of
 from equipix.measured.statistics import FrameStatistics, subtracted
 from equipix.plan.budget import between_pixels, error_budget
@@ -68,11 +68,13 @@ class Estimate(Brief):
         Expected root mean square of the relative error of M by noise, by the noise and rounding of
         the dark and, where the positions show it, by the drift of the lamp. Infinite with more than
         one part; NaN where the noise is not known, as of one frame at each of too few positions, or
-        where its effect is not (see `equipix.plan.error_budget`).
+        where its effect is not, as with positions less than a pixel apart (see
+        `equipix.plan.error_budget`).
     rms_by_cause : dict of str to float
-        The same for ``"noise"``, ``"dark"`` and ``"drift"`` alone; NaN where `rms` is. The dark is
-        0 where there is none. The drift is NaN also where fewer than four positions are known, or
-        the fit is too far from its minimum, so that no residual shows it.
+        The same for ``"noise"``, ``"dark"`` and ``"drift"`` alone. The noise is NaN where `rms` is.
+        The dark is 0 where there is none, and NaN where no pixel is known. The drift is NaN where
+        the noise is not known, fewer than four positions are, or the fit is too far from its
+        minimum, so that no residual shows it.
     tilt : tuple of float
         Standard deviation of the tilt of ln M, edge to edge (row, col), that noise and drift leave.
         NaN where the noise is not known.
@@ -128,7 +130,7 @@ class Needed(Brief):
         Parts of the sensor that all positions will not compare, this one among them.
     rms : float
         Expected error of M with as many frames there as at the others on average; infinite with
-        more than one part, NaN where the noise is not known.
+        more than one part, NaN where the noise or its effect is not known.
     """
 
     position: tuple[float, float]
@@ -413,8 +415,8 @@ class Running:
         """Noise of an exposure over its signal, NaN if unknown; error of M by the dark; drift.
 
         Each pixel counts with the weight of its exposures: its noise is that of equal exposures
-        which determine it as well. Of these the root mean square is taken. That fewer exposures
-        compare a pixel with fewer others is not counted.
+        which determine it as well. Of these the root mean square is taken. A pixel of fewer
+        exposures is compared with fewer others, too: that is not counted.
         """
         shown = None if calibration is None else calibration.drift
         drift = 0.0 if shown is None else shown.size
@@ -432,15 +434,18 @@ class Running:
             weight = np.divide(1, variance, where=seen, out=np.zeros(self._shape))
             weights += weight
             information += np.multiply(weight, signal**2, where=seen, out=np.zeros(self._shape))
+        of_dark = measured.dark_variance
+        if of_dark is None and self._dark is not None:
+            of_dark = np.broadcast_to(variance_of_dark_alone(self._dark), self._shape)
         known = np.isfinite(information) & (information > 0)
         if calibration is not None:
             known &= usable(calibration.flags)
         if not known.any():
-            return math.nan, 0.0 if measured.dark_variance is None else math.nan, drift
+            return math.nan, 0.0 if of_dark is None else math.nan, drift
         noise = float(np.sqrt(len(measured) * np.mean(1 / information[known])))
         dark = 0.0
-        if measured.dark_variance is not None:
-            added = measured.dark_variance[known] * weights[known] / information[known]
+        if of_dark is not None:
+            added = of_dark[known] * weights[known] / information[known]
             dark = float(np.sqrt(np.mean(added)))
         return noise if noise > 0 else math.nan, dark, drift
 

@@ -45,7 +45,8 @@ class ErrorBudget:
     shifts : ndarray, shape (n, 2), float64
         The shifts (row, col) in pixels.
     rms : float
-        Root mean square over the sensor of all errors, those by cause in quadrature.
+        Root mean square over the sensor of all errors, those by cause in quadrature; NaN where that
+        by noise is not known, see `error_budget`.
     rms_by_cause : dict
         The same for ``"noise"``, ``"drift"`` and ``"shift_error"`` alone.
     tilt_by_cause : dict
@@ -147,7 +148,8 @@ def error_budget(
         If the tilt that drift leaves exceeds the error from noise.
     IdentifiabilityWarning
         If the shifts leave parts of the sensor uncompared, lie on one line, or, between pixels, do
-        not constrain a wave; if the beam lights only a part of the sensor.
+        not constrain a wave or leave the error by noise unknown; if the beam lights only a part of
+        the sensor.
 
     Notes
     -----
@@ -260,8 +262,8 @@ def _on_noise(budget: ErrorBudget) -> str | None:
     if not np.isnan(budget.rms_by_cause["noise"]):
         return None
     return (
-        "rounded to whole pixels, the shifts leave most of the sensor unconnected: between pixels "
-        "the error by noise is not known then: choose other shifts (equipix.plan.suggest)"
+        "the error by noise is not known, since the shifts, rounded to whole pixels, compare at "
+        "most half of the sensor: choose other shifts (equipix.plan.suggest)"
     )
 
 
