@@ -159,6 +159,7 @@ def test_no_accuracy_is_met_where_the_effect_of_noise_is_not_known() -> None:
     assert estimate.components == 1
     assert math.isnan(estimate.rms)
     assert math.isnan(running.needed().rms)
+    assert not estimate.meets(1)
 
 
 @pytest.mark.parametrize(

@@ -314,6 +314,7 @@ def test_it_says_where_the_dark_limits_most(tmp_path: Path) -> None:
     shown["rms"] = math.nan
     shown["next"]["rms"] = math.nan
     assert "expected error not known" in _in_words(shown)
+    assert _in_words(shown).endswith(": error not known")
     assert "nan" not in _in_words(shown)
 
 

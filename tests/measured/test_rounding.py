@@ -8,7 +8,7 @@ import pytest
 import equipix
 from equipix import nuc
 from equipix.measured.defects import hot_pixels
-from equipix.measured.means import Averaged
+from equipix.measured.means import Averaged, variance_of_dark_alone
 from equipix.measured.noise import (
     largest_scatter,
     photon_transfer,
@@ -143,6 +143,24 @@ def test_the_mean_of_frames_is_off_by_the_variance_of_the_model(sigma, frames):
     error = float(np.mean((average.mean - signal) ** 2))
     # The square of an error scatters by at most √2 of its mean, over 16 384 pixels; so does s².
     assert float(noise.variance(1000.0)) == pytest.approx(error, rel=5 * 2 * np.sqrt(1 / 2**13))
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.05, 0.2, 0.5, 1.5, 10.0])
+@pytest.mark.parametrize("frames", [2, 3, 64])
+def test_the_mean_of_dark_frames_is_off_by_what_they_show_alone(sigma, frames):
+    rng = np.random.default_rng(4)
+    signal = even(rng, (128, 128))
+    dark = equipix.average(rounded(rng, signal, sigma, frames))
+    error = float(np.mean((dark.mean - signal) ** 2))
+    assert variance_of_dark_alone(dark) == pytest.approx(error, rel=5 * 2 * np.sqrt(1 / 2**13))
+
+
+@pytest.mark.parametrize("frames", [1, 2, 16])
+def test_equal_dark_frames_that_are_not_rounded_show_no_noise(frames):
+    dark = np.full((frames, 20, 30), 100.25)
+    assert variance_of_dark_alone(equipix.average(dark)) == 0
+    dark[0, 3, 4] = 101.7  # most are 0 apart, one frame is not
+    assert variance_of_dark_alone(equipix.average(dark)) < 1e-3
 
 
 @pytest.mark.parametrize("sigma", [0.05, 0.2])

@@ -68,13 +68,14 @@ class Estimate(Brief):
         Expected root mean square of the relative error of M by noise, by the noise and rounding of
         the dark and, where the positions show it, by the drift of the lamp. Infinite with more than
         one part; NaN where the noise is not known, as of one frame at each of too few positions, or
-        where its effect is not, as with positions less than a pixel apart (see
-        `equipix.plan.error_budget`).
+        where its effect is not, as with positions that, rounded to whole pixels, compare too few
+        (see `equipix.plan.error_budget`).
     rms_by_cause : dict of str to float
         The same for ``"noise"``, ``"dark"`` and ``"drift"`` alone. The noise is NaN where `rms` is.
         The dark is 0 where there is none, and NaN where no pixel is known. The drift is NaN where
         the noise is not known, fewer than four positions are, or the fit is too far from its
-        minimum, so that no residual shows it.
+        minimum, so that no residual shows it. With more than one part noise and dark are infinite,
+        the drift is NaN.
     tilt : tuple of float
         Standard deviation of the tilt of ln M, edge to edge (row, col), that noise and drift leave.
         NaN where the noise is not known.

@@ -16,7 +16,7 @@ from equipix._check import EXPOSURES, Array, Bools, Floats, Pixels, Words
 from equipix.errors import InputError
 from equipix.measured import defects
 from equipix.measured.colour import Colours, Filters, mean_rise, pattern_of, planes_of
-from equipix.measured.noise import UNIFORM, NoiseModel, photon_transfer
+from equipix.measured.noise import NoiseModel, photon_transfer
 from equipix.measured.part import chosen, median, spread
 from equipix.measured.saturation import Clipping, clipping_of, highest, refuse_saturated, unclipped
 from equipix.measured.statistics import STRAY, FrameStatistics, Light, light_of, same_statistics
@@ -430,18 +430,13 @@ def _variance_of_dark(dark: FrameStatistics, noise: NoiseModel) -> Floats:
 
 
 def variance_of_dark_alone(dark: FrameStatistics) -> Floats:
-    """Variance of the mean of dark frames, from these alone: where no exposure shows its noise.
-
-    The median of a sample variance of k degrees of freedom is (1 − 2/(9k))³ of the variance (E. B.
-    Wilson, M. M. Hilferty, Proceedings of the National Academy of Sciences 17 (1931) 684-688).
-    """
-    degrees = int(dark.count.max()) - 1
-    if degrees > 0:
-        of_frame = median(dark.variance) / (1 - 2 / (9 * degrees)) ** 3
-    else:
-        of_frame = _between_neighbours(dark.mean)
-    of_frame = max(of_frame, UNIFORM * dark.step**2)
-    return _variance_of_dark(dark, NoiseModel(float(np.sqrt(of_frame)), 0.0, step=dark.step))
+    """Variance of the mean of dark frames, from these alone: where no exposure shows its noise."""
+    points = _points(dark, np.zeros(dark.mean.shape), dark.saturated == 0, light_of(dark))
+    if len(points) == 0:
+        points = np.array([(0.0, _between_neighbours(dark.mean), 1.0)])
+    if dark.step == 0 and not points[:, 1].any():
+        return np.zeros(())  # equal frames that are not rounded show none
+    return _variance_of_dark(dark, NoiseModel.fit(points, step=dark.step))
 
 
 def _between_neighbours(frame: Array) -> float:
