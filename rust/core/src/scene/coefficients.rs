@@ -33,30 +33,21 @@ impl Coefficients {
         });
     }
 
-    /// Gives what the mean gain and the mean offset lost back to each pixel in proportion to its part, and
-    /// holds the gauge.
-    pub(super) fn hold_gauge_by(&mut self, part: &[f32], workers: &Workers) {
+    /// Holds the gauge: gives what the mean gain and the mean offset lost, by their [`sums`], back to each pixel in
+    /// proportion to its part. Rounding is left, and given back the next time.
+    pub(super) fn hold_gauge_by(&mut self, part: &[f32], lost: [f64; 4], workers: &Workers) {
         let size = BAND * self.shape.cols;
-        let pixels = self.shape.len() as f64;
-        let sums = workers.map_pairs(
-            &mut self.gain,
-            &mut self.offset,
-            [size, size],
-            |index, gain, offset| {
-                let part = &part[index * size..][..gain.len()];
-                [sum(gain), sum(offset), dot(gain, part), sum(part)]
-            },
-        );
-        let [gains, offsets, taken, parts] = fold(sums);
+        let [gains, offsets, taken, parts] = lost;
         if taken > 0.0 {
-            let factor = ((pixels - gains) / taken) as f32;
+            let factor = ((self.shape.len() as f64 - gains) / taken) as f32;
             let shift = (offsets / parts) as f32;
-            let parts = bands!(size; &mut self.gain, &mut self.offset);
-            workers.each(parts, |index, (gain, offset)| {
+            let bands = bands!(size; &mut self.gain, &mut self.offset);
+            workers.each(bands, |index, (gain, offset)| {
                 give_back(gain, offset, &part[index * size..], [factor, shift]);
             });
+        } else {
+            self.hold_gauge(workers);
         }
-        self.hold_gauge(workers);
     }
 
     /// Holds mean(g) = 1 and mean(o) = 0: the corrected frame becomes (X − mean(o)) / mean(g).
@@ -79,6 +70,11 @@ impl Coefficients {
         });
         taken
     }
+}
+
+/// Σ g, Σ o, Σ g part and Σ part.
+pub(super) fn sums(gain: &[f32], offset: &[f32], part: &[f32]) -> [f64; 4] {
+    [sum(gain), sum(offset), dot(gain, part), sum(part)]
 }
 
 wide! {

@@ -19,7 +19,7 @@
 //!    moves of it for each part that persists. Updates that follow one another have a frame in common.
 
 use super::bands::{BAND, bands, fold, wide};
-use super::coefficients::{Coefficients, sum_of_squares};
+use super::coefficients::{Coefficients, sum_of_squares, sums};
 use super::method::step_at;
 use super::state::State;
 use crate::frames::Shape;
@@ -50,12 +50,14 @@ pub(super) struct Descent {
     part: Vec<f32>,
 }
 
-/// The errors of a frame, and the part that each of its pixels took in them.
-#[derive(Clone, Copy, Debug)]
+/// The errors of a frame, `sign` times `errors`.
+#[derive(Clone, Copy)]
 pub(super) struct Pull<'a> {
     pub(super) raw: &'a [f32],
     pub(super) errors: &'a [f32],
-    pub(super) part: &'a [f32],
+    pub(super) sign: f32,
+    /// Writes the part that each pixel of a row took in them.
+    pub(super) part: &'a (dyn Fn(usize, &mut [f32]) + Sync),
 }
 
 impl Descent {
@@ -73,15 +75,18 @@ impl Descent {
         self.centre += (share * (mean - f64::from(self.centre))) as f32;
     }
 
-    /// Takes the errors of an update, which set the step.
-    pub(super) fn take(&mut self, errors: &[f32], workers: &Workers) {
+    /// Takes the errors of an update, the sum of its pulls, which set the step.
+    fn take(&mut self, pulls: &[Pull<'_>], workers: &Workers) {
         let size = BAND * self.shape.cols;
         let squares = workers.map_blocks(&mut self.before[0], size, |index, before| {
-            let errors = &errors[index * size..][..before.len()];
-            let total = sum_of_squares(before) + sum_of_squares(errors);
-            subtract(before, errors);
+            let mut errors = vec![0.0; before.len()];
+            for pull in pulls {
+                add(&mut errors, pull.sign, &pull.errors[index * size..]);
+            }
+            let total = sum_of_squares(before) + sum_of_squares(&errors);
+            add(before, -1.0, &errors);
             let apart = sum_of_squares(before);
-            before.copy_from_slice(errors);
+            before.copy_from_slice(&errors);
             [apart, (total - apart) / 2.0]
         });
         if self.updates >= 2 {
@@ -96,21 +101,26 @@ impl Descent {
 
     /// Changes the coefficients by the pulls of one frame or two, and holds the gauge.
     pub(super) fn learn(&mut self, pulls: &[Pull<'_>], to: &mut Coefficients, workers: &Workers) {
+        self.take(pulls, workers);
         let (cols, centre) = (self.shape.cols, self.centre);
         let noise = f64::from(self.variance.max(0.0)) / (self.half * self.half);
         let step = (self.step / (1.0 + noise)) as f32;
         let bands = bands!(BAND * cols; &mut to.gain, &mut to.offset, &mut self.part);
-        workers.each(bands, |index, (gain, offset, part)| {
+        let lost = workers.each(bands, |index, (gain, offset, part)| {
+            let mut taken = vec![0.0; cols];
             part.fill(0.0);
             for pull in pulls {
-                let start = index * BAND * cols;
-                let [raw, errors, taken] =
-                    [pull.raw, pull.errors, pull.part].map(|each| &each[start..]);
-                let pull = Pull { raw, errors, part: taken };
-                descend(pull, [step, centre], gain, offset, part);
+                let rows = gain.chunks_mut(cols).zip(offset.chunks_mut(cols));
+                for (line, ((gain, offset), part)) in rows.zip(part.chunks_mut(cols)).enumerate() {
+                    let row = index * BAND + line;
+                    (pull.part)(row, &mut taken);
+                    let [raw, errors] = [pull.raw, pull.errors].map(|each| &each[row * cols..]);
+                    descend([raw, errors, &taken], [pull.sign, step, centre], gain, offset, part);
+                }
             }
+            sums(gain, offset, part)
         });
-        to.hold_gauge_by(&self.part, workers);
+        to.hold_gauge_by(&self.part, fold(lost), workers);
     }
 
     pub(super) fn state(&mut self) -> State<'_> {
@@ -127,25 +137,25 @@ impl Descent {
 }
 
 wide! {
-fn subtract<'s>(values: &'s mut [f32], others: &'s [f32]) -> () {
+fn add<'s>(values: &'s mut [f32], sign: f32, others: &'s [f32]) -> () {
     for (value, other) in values.iter_mut().zip(others) {
-        *value -= other;
+        *value += sign * other;
     }
 }
 }
 
 wide! {
-/// Changes coefficients by a pull, and adds the step to the part of each pixel.
+/// Changes coefficients by the raw values, errors and parts of a pull, and adds the step to the part of each pixel.
 fn descend<'s>(
-    pull: Pull<'s>, by: [f32; 2], gain: &'s mut [f32], offset: &'s mut [f32], part: &'s mut [f32],
+    pull: [&'s [f32]; 3], by: [f32; 3], gain: &'s mut [f32], offset: &'s mut [f32], part: &'s mut [f32],
 ) -> () {
-    let [step, centre] = by;
-    let values = pull.raw.iter().zip(pull.errors).zip(pull.part);
+    let ([raw, errors, taken], [sign, step, centre]) = (pull, by);
+    let values = raw.iter().zip(errors).zip(taken);
     let pixels = gain.iter_mut().zip(offset).zip(part);
     for (((gain, offset), part), ((y, error), taken)) in pixels.zip(values) {
         let depth = y - centre;
         let step = step_at(step, depth);
-        let change = step * error;
+        let change = step * sign * error;
         *gain += change * depth;
         *offset += change - centre * change * depth;
         *part += step * taken;
@@ -162,6 +172,11 @@ mod tests {
 
     fn one() -> Workers {
         Workers::new(std::num::NonZeroUsize::new(1)).unwrap()
+    }
+
+    /// The pull of a frame in which all pixels take part.
+    fn pull<'a>(raw: &'a [f32], errors: &'a [f32]) -> Pull<'a> {
+        Pull { raw, errors, sign: 1.0, part: &|_, part| part.fill(1.0) }
     }
 
     /// Independent values of variance 1, other for each seed.
@@ -181,7 +196,7 @@ mod tests {
             let (moved, own) = (noise(100 + index), noise(200 + index));
             let parts = pattern.iter().zip(&moved).zip(&own);
             let errors = parts.map(|((p, m), n)| persists * p + moves * m + DEVIATION * n);
-            descent.take(&errors.collect::<Vec<_>>(), &one());
+            descent.take(&[pull(&[], &errors.collect::<Vec<_>>())], &one());
         }
         f64::from(descent.variance) / f64::from(DEVIATION).powi(2)
     }
@@ -201,7 +216,7 @@ mod tests {
 
     #[test]
     fn errors_pull_about_the_centre_by_a_step_that_noise_halves() {
-        let (raw, part) = (vec![0.75; SHAPE.len()], vec![1.0; SHAPE.len()]);
+        let raw = vec![0.75; SHAPE.len()];
         let signs = (0..SHAPE.len()).map(|pixel| if pixel % 2 == 0 { 0.01 } else { -0.01 });
         let errors: Vec<f32> = signs.collect();
         let square = DEVIATION * DEVIATION;
@@ -210,8 +225,7 @@ mod tests {
             descent.follow(0.25);
             descent.variance = variance;
             let mut learned = Coefficients::new(SHAPE);
-            let pull = Pull { raw: &raw, errors: &errors, part: &part };
-            descent.learn(&[pull], &mut learned, &one());
+            descent.learn(&[pull(&raw, &errors)], &mut learned, &one());
             // X changes by η E ((y − m)² + 1) at the raw value, and by η E at the centre; of such errors the
             // gauge takes nothing.
             for (pixel, error) in errors.iter().enumerate() {

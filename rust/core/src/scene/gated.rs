@@ -113,8 +113,10 @@ impl Method for Gated {
         let [changed] = fold(counts);
         self.descent.follow(frame.level);
         if changed > 0.0 {
-            let pull = Pull { raw: frame.raw, errors: &self.errors, part: &self.part };
-            self.descent.take(&self.errors, workers);
+            let part = |row: usize, line: &mut [f32]| {
+                line.copy_from_slice(&self.part[row * cols..(row + 1) * cols]);
+            };
+            let pull = Pull { raw: frame.raw, errors: &self.errors, sign: 1.0, part: &part };
             self.descent.learn(&[pull], coefficients, workers);
         }
         changed > 0.0

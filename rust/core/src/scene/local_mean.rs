@@ -1,6 +1,6 @@
 //! Towards the mean of the neighbours, in every frame.
 
-use super::bands::{BAND, bands};
+use super::bands::BAND;
 use super::coefficients::Coefficients;
 use super::descent::{Descent, Pull};
 use super::method::{Frame, Method};
@@ -17,7 +17,6 @@ pub(super) struct LocalMean {
     kernel: Kernel,
     descent: Descent,
     errors: Vec<f32>,
-    part: Vec<f32>,
 }
 
 /// Noise in the errors at which the step is halved. The detail of a scene counts as noise; it is a third of this
@@ -32,7 +31,6 @@ impl LocalMean {
             kernel: Kernel::new(sizes, &weights),
             descent: Descent::new(shape, step, HALF, 0.0),
             errors: vec![0.0; shape.len()],
-            part: vec![1.0; shape.len()],
         })
     }
 }
@@ -63,23 +61,24 @@ impl Method for LocalMean {
     ) -> bool {
         let cols = frame.shape.cols;
         let image = Image::new(frame.shape, frame.corrected);
-        let bands = bands!(BAND * cols; &mut self.errors, &mut self.part);
-        workers.each(bands, |index, (errors, part)| {
-            let mut padded = Vec::new();
-            let rows = errors.chunks_mut(cols).zip(part.chunks_mut(cols));
-            for (row, (errors, part)) in rows.enumerate() {
+        let part = |row: usize, line: &mut [f32]| {
+            for (col, part) in line.iter_mut().enumerate() {
+                *part = if frame.leaves_out(row, col) { 0.0 } else { 1.0 };
+            }
+        };
+        workers.map_blocks(&mut self.errors, BAND * cols, |index, errors| {
+            let (mut padded, mut taken) = (Vec::new(), vec![0.0; cols]);
+            for (row, errors) in errors.chunks_mut(cols).enumerate() {
                 let row = index * BAND + row;
                 self.kernel.mean(image, row, &mut padded, errors);
-                let (_, corrected) = frame.row(row);
-                for (col, (error, part)) in errors.iter_mut().zip(part).enumerate() {
-                    *part = if frame.leaves_out(row, col) { 0.0 } else { 1.0 };
-                    *error = *part * (*error - corrected[col]);
+                part(row, &mut taken);
+                for ((error, part), value) in errors.iter_mut().zip(&taken).zip(frame.row(row).1) {
+                    *error = part * (*error - value);
                 }
             }
         });
-        let pull = Pull { raw: frame.raw, errors: &self.errors, part: &self.part };
+        let pull = Pull { raw: frame.raw, errors: &self.errors, sign: 1.0, part: &part };
         self.descent.follow(frame.level);
-        self.descent.take(&self.errors, workers);
         self.descent.learn(&[pull], coefficients, workers);
         true
     }

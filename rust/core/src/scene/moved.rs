@@ -191,7 +191,7 @@ pub(super) struct Own<'a> {
 
 impl Own<'_> {
     /// Writes 0 for the pixels that are left out, of some from `start` on, and counts them.
-    fn clear(&self, start: usize, values: &mut [f32]) -> usize {
+    pub(super) fn clear(&self, start: usize, values: &mut [f32]) -> usize {
         let Some(left_out) = self.left_out else { return 0 };
         let mut count = 0;
         for (value, _) in values.iter_mut().zip(&left_out[start..]).filter(|(_, out)| **out) {

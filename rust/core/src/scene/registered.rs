@@ -4,7 +4,6 @@
 //! registration", Journal of the Optical Society of America A 28 (2011) 1164–1176, with both frames of a pair
 //! corrected: with one alone the border, which has no partner, is carried inwards by the motion.
 
-use super::bands::{BAND, bands};
 use super::coefficients::Coefficients;
 use super::descent::{Descent, Pull};
 use super::method::{Frame, Method};
@@ -73,9 +72,6 @@ struct Scratch {
     coefficients: Vec<f32>,
     error: Vec<f32>,
     transposed: Vec<f32>,
-    /// E − Sᵀ E, and the part of each pixel in the later and the earlier frame.
-    both: Vec<f32>,
-    parts: [Vec<f32>; 2],
 }
 
 /// Mean square of the differences of earlier pairs, and their number.
@@ -135,8 +131,6 @@ impl Registered {
                 coefficients: empty(),
                 error: empty(),
                 transposed: empty(),
-                both: empty(),
-                parts: [empty(), empty()],
             },
         })
     }
@@ -151,15 +145,8 @@ impl Registered {
         workers: &Workers,
     ) -> bool {
         let shape = self.shape;
-        let Scratch {
-            corrected,
-            along,
-            coefficients: spline,
-            error,
-            transposed: back,
-            both,
-            parts,
-        } = &mut self.scratch;
+        let Scratch { corrected, along, coefficients: spline, error, transposed: back } =
+            &mut self.scratch;
         let (before, way) = (&self.before[..], Move::new(shape, shift));
         coefficients.apply(before, corrected, workers);
         frame.fill.write(corrected);
@@ -171,55 +158,28 @@ impl Registered {
             return false;
         }
         transposed(shape, error, &way, [spline, along], back, workers);
-        fill_parts(shape, &way, left_out.as_deref(), parts, workers);
-        let size = BAND * shape.cols;
-        let bands = bands!(size; both, back);
-        workers.each(bands, |index, (both, back)| {
-            for ((both, back), error) in both.iter_mut().zip(back).zip(&error[index * size..]) {
-                *back = -*back;
-                *both = error + *back;
+        // The share of its own noise that each pixel of the later and of the earlier frame pulls on itself: 1 where the
+        // move is inside, and the diagonal of Sᵀ S.
+        let ([rows, columns], [down, across]) = (&way.inside, way.diagonals(shape));
+        let inside = |row: usize, part: &mut [f32]| {
+            part.fill(0.0);
+            if rows.contains(&row) {
+                part[columns.clone()].fill(1.0);
+                own.clear(row * shape.cols, part);
             }
-        });
-        self.descent.take(both, workers);
-        let [own, other] = parts;
+        };
+        let diagonal = |row: usize, part: &mut [f32]| {
+            for (part, across) in part.iter_mut().zip(&across) {
+                *part = down[row] * across;
+            }
+        };
         let pulls = [
-            Pull { raw: frame.raw, errors: error, part: own },
-            Pull { raw: before, errors: back, part: other },
+            Pull { raw: frame.raw, errors: error, sign: 1.0, part: &inside },
+            Pull { raw: before, errors: back, sign: -1.0, part: &diagonal },
         ];
         self.descent.learn(&pulls, coefficients, workers);
         true
     }
-}
-
-/// Writes the share of its own noise that each pixel of the later and of the earlier frame pulls on itself: 1 where
-/// the move is inside, and the diagonal of Sᵀ S.
-fn fill_parts(
-    shape: Shape,
-    way: &Move,
-    left_out: Option<&[bool]>,
-    [own, other]: &mut [Vec<f32>; 2],
-    workers: &Workers,
-) {
-    let (cols, [down, across]) = (shape.cols, way.diagonals(shape));
-    let [rows, columns] = &way.inside;
-    let bands = bands!(BAND * cols; own, other);
-    workers.each(bands, |index, (own, other)| {
-        let lines = own.chunks_mut(cols).zip(other.chunks_mut(cols)).enumerate();
-        for (line, (own, other)) in lines {
-            let row = index * BAND + line;
-            own.fill(0.0);
-            if rows.contains(&row) {
-                own[columns.clone()].fill(1.0);
-            }
-            if let Some(out) = left_out {
-                let pixels = own.iter_mut().zip(&out[row * cols..]);
-                pixels.filter(|(_, out)| **out).for_each(|(part, _)| *part = 0.0);
-            }
-            for (part, across) in other.iter_mut().zip(&across) {
-                *part = down[row] * across;
-            }
-        }
-    });
 }
 
 /// Pixels of the later frame that are saturated, or whose place in the earlier one is within two pixels of
