@@ -159,8 +159,21 @@ def test_the_mean_of_dark_frames_is_off_by_what_they_show_alone(sigma, frames):
 def test_equal_dark_frames_that_are_not_rounded_show_no_noise(frames):
     dark = np.full((frames, 20, 30), 100.25)
     assert variance_of_dark_alone(equipix.average(dark)) == 0
-    dark[0, 3, 4] = 101.7  # most are 0 apart, one frame is not
+    dark[0, 3, 4] = 101.7  # most are 0 apart, one is not
     assert variance_of_dark_alone(equipix.average(dark)) < 1e-3
+
+
+@pytest.mark.parametrize("frames", [3, 4, 8])
+def test_an_offset_that_dark_frames_have_in_common_is_no_noise(frames):
+    rng = np.random.default_rng(frames)
+    offset = 5 * rng.standard_normal((frames, 1, 1))
+    pattern = rng.normal(200, 30, (128, 128))
+    dark = equipix.average(np.rint(pattern + offset + 2 * rng.standard_normal((frames, 128, 128))))
+    # s² over 16 384 pixels with two degrees of freedom or more, and 1/12 of rounding.
+    wanted = (4 + 1 / 12) / frames
+    assert variance_of_dark_alone(dark) == pytest.approx(wanted, rel=5 * np.sqrt(1 / 2**14))
+    alone = equipix.average(100.25 + offset + np.zeros((1, 20, 30)))
+    assert variance_of_dark_alone(alone) == pytest.approx(0, abs=1e-12)
 
 
 @pytest.mark.parametrize("sigma", [0.05, 0.2])

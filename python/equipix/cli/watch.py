@@ -145,7 +145,7 @@ def _in_words(shown: dict[str, Any]) -> str:
 def _error_in_words(shown: dict[str, Any]) -> list[str]:
     """Write the expected error with its causes, or that it is not known."""
     if math.isnan(shown["rms"]):
-        return ["expected error not known: take two frames or more at each position, and move on"]
+        return ["expected error not known: take two frames or more at each position, pixels apart"]
     noise, dark, drift = (shown["rms_by_cause"][each] for each in ("noise", "dark", "drift"))
     known = "lamp drift not known yet" if math.isnan(drift) else f"lamp drift {drift:.1e}"
     down, right = shown["tilt_std"]

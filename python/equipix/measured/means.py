@@ -242,16 +242,14 @@ class Averaged:
             points.append(each - (0, added, 0))
             known |= self.gain is not None and len(each) > 0
         every = np.concatenate(points)
-        if not known or (self.step == 0 and not every[:, 1].any()):
+        if not known or (self.step == 0 and not np.any(every[:, 1] > 0)):
             return None
         return NoiseModel.fit(every, gain=self.gain, step=self.step)
 
     @cached_property
     def _dark_points(self) -> list[Array]:
         """Points of the photon-transfer curve of each dark, at signal 0."""
-        free = (each.saturated == 0 for each in self.darks)
-        pairs = zip(self.darks, free, strict=True)
-        return [_points(d, np.zeros(d.mean.shape), usable, light_of(d)) for d, usable in pairs]
+        return [_points_of_dark(each) for each in self.darks]
 
     @cached_property
     def _beside_least(self) -> list[float]:
@@ -431,10 +429,10 @@ def _variance_of_dark(dark: FrameStatistics, noise: NoiseModel) -> Floats:
 
 def variance_of_dark_alone(dark: FrameStatistics) -> Floats:
     """Variance of the mean of dark frames, from these alone: where no exposure shows its noise."""
-    points = _points(dark, np.zeros(dark.mean.shape), dark.saturated == 0, light_of(dark))
+    points = _points_of_dark(dark)
     if len(points) == 0:
         points = np.array([(0.0, _between_neighbours(dark.mean), 1.0)])
-    if dark.step == 0 and not points[:, 1].any():
+    if dark.step == 0 and not np.any(points[:, 1] > 0):
         return np.zeros(())  # equal frames that are not rounded show none
     return _variance_of_dark(dark, NoiseModel.fit(points, step=dark.step))
 
@@ -463,3 +461,11 @@ def _points(
     common = None if light == Light() else light.variance(frames.mean)
     count = int(frames.count.max())
     return photon_transfer(signal, frames.variance, known, count, frames.step, common, period)
+
+
+def _points_of_dark(dark: FrameStatistics) -> Array:
+    """Points of the curve of dark frames, at signal 0: what pixels have in common is an offset."""
+    light = light_of(dark)
+    if light.relative:
+        light = Light(offset=dark.light_variance or 0.0)
+    return _points(dark, np.zeros(dark.mean.shape), dark.saturated == 0, light)
