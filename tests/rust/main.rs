@@ -10,6 +10,7 @@ mod dense;
 mod descent;
 mod estimate;
 mod experiment;
+mod far_positions;
 mod few_measurements;
 mod fit;
 mod fixed_point;

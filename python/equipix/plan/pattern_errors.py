@@ -310,7 +310,8 @@ class Spectrum:
         λ there.
     passes : float
         Products with the data that `calibrate` is expected to take for such shifts, whatever the
-        size of the sensor: within a factor of two. Between pixels it only compares patterns.
+        size of the sensor: within a factor of two, but at whole shifts never many more than 60.
+        Between pixels it only compares patterns.
     """
 
     rows: Floats

@@ -141,7 +141,7 @@ def suggest(
     one by one to where the predicted error is least.
 
     The farther five or six positions are apart, the more waves are barely constrained, and the more
-    products the solver takes (`budget.spectrum.passes`). Above 100 of them the error counts more,
+    products the solver takes between pixels (`budget.spectrum.passes`). Above 100 of them the error counts more,
     by the square of their number: five positions then use a part of a large travel only. A sixth
     or seventh position allows for a larger part of it.
 

@@ -12,6 +12,7 @@
 //! A slight ridge makes it definite: what it is not definite in, by constants in pieces that are not
 //! connected or by shifts along one line only, is no error that S can see.
 
+mod aggregates;
 mod hats;
 mod matrix;
 mod modulated;
@@ -20,9 +21,12 @@ mod modulated_matrix;
 mod spacing;
 mod spectrum;
 
+pub(crate) use aggregates::{Cycle, Edges, Graph, NONE, Partition};
 pub(crate) use hats::Hats;
 pub(crate) use matrix::{Coarse, Entry};
 pub(crate) use modulated::Modulated;
 pub(crate) use modulated_matrix::{SeenWave, Spot};
 pub(crate) use spacing::{DAMPING, bytes_needed, spacing, spacing_of_waves};
-pub(crate) use spectrum::{Complex, MOST_WAVES, Symbol, barely_constrained, times};
+pub(crate) use spectrum::{
+    BarelyConstrained, Complex, DEEPEST, MOST_WAVES, Symbol, barely_constrained, times,
+};

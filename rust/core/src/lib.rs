@@ -126,7 +126,7 @@
 //! ritz            the smallest Ritz value, from conjugate gradients
 //! beam            the light that a sensor sees of the beam from any position
 //! weak_light      the prior of M where light is weak: what decides it, and its part of a linear problem
-//! coarse          hats on a coarse grid, and the matrix of a problem in them
+//! coarse          hats on a coarse grid, aggregates of pixels, and the matrix of a problem in them
 //! connectivity    what the measurements can compare; connected pixels
 //! information     the information D = Σ w c² L² of each pixel on M: its inverse variance with a known beam
 //! exposures       measurements, weights, positions, fluxes; the one check of their values

@@ -73,7 +73,7 @@ impl Padding {
     }
 
     /// As [`body_mut`](Self::body_mut), to read.
-    pub(crate) fn body<'i>(&self, image: &'i [f32]) -> &'i [f32] {
+    pub(crate) fn body<'i, V>(&self, image: &'i [V]) -> &'i [V] {
         &image[self.lead..image.len() - self.lead]
     }
 

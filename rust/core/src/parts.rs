@@ -43,9 +43,9 @@ impl<'m, 'a, T: Real> Parts<'m, 'a, T> {
     ///
     /// # Errors
     /// As [`assemble`](Self::assemble).
-    pub fn factorise(&self, control: &Control) -> Result<()> {
+    pub fn factorise(&mut self, control: &Control) -> Result<()> {
         let mut two_level = TwoLevel::new(self.exposures, self.reduced.padding, self.workers);
-        two_level.prepare(&self.reduced, control)
+        two_level.prepare(&mut self.reduced, control)
     }
 
     /// Multiplies S by an x.

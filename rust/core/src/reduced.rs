@@ -17,6 +17,7 @@
 //! single precision: M, L and b are kept in double precision outside, and each Gauss-Newton step
 //! makes good what the one before left by rounding (iterative refinement).
 
+mod aggregated;
 mod blocks;
 mod conjugate_gradients;
 mod dark;

@@ -16,7 +16,7 @@ use std::f64::consts::{PI, TAU};
 pub(crate) type Complex = [f64; 2];
 
 /// Waves of a larger λ do not delay conjugate gradients: the second level has eigenvalues of 1/4.
-const DEEPEST: f64 = 0.2;
+pub(crate) const DEEPEST: f64 = 0.2;
 /// Below, a wave is as good as undetermined, and single precision leaves errors in it.
 const DETERMINED: f64 = 1e-5;
 /// Minima of the scan that are followed further down.
@@ -51,14 +51,22 @@ pub(crate) struct Wave {
     pub(crate) is_alone: bool,
 }
 
-/// The deepest minima of λ, apart from q = 0, for exposures of these shares that reach so many pixels, and
-/// hats so far apart: the hats around one wave hold those that are nearer to it than π over that.
+/// The waves that exposures barely constrain.
+pub(crate) struct BarelyConstrained {
+    /// The deepest minima of λ, apart from q = 0.
+    pub(crate) waves: Vec<Wave>,
+    /// The share of all wave vectors at which λ is below [`DEEPEST`].
+    pub(crate) share: f64,
+}
+
+/// Those of exposures of these shares that reach so many pixels, and hats so far apart: the hats around one
+/// wave hold those that are nearer to it than π over that.
 pub(crate) fn barely_constrained(
     symbol: &impl Symbol,
     shares: &[f64],
     reach: [usize; 2],
     spacing: [f64; 2],
-) -> Vec<Wave> {
+) -> BarelyConstrained {
     let sizes = reach.map(|reach| (STEPS_A_PIXEL * reach).clamp(STEPS[0], STEPS[1]));
     let scan = Scan::new(symbol, shares, sizes);
     let mut places = scan.minima();
@@ -80,7 +88,8 @@ pub(crate) fn barely_constrained(
             waves.push(Wave { vector, is_alone });
         }
     }
-    waves
+    let below = scan.depths.iter().filter(|&&depth| depth < DEEPEST).count();
+    BarelyConstrained { waves, share: below as f64 / scan.depths.len() as f64 }
 }
 
 /// A wave vector between −π and π.
@@ -210,7 +219,7 @@ mod tests {
     #[test]
     fn waves_of_a_cross_are_its_deepest_minima() {
         let cross = [[0.0, 0.0], [0.0, 11.0], [0.0, 19.0], [11.0, 0.0], [19.0, 0.0]];
-        let waves = barely_constrained(&Shifts(&cross), &[0.2; 5], [19, 19], [57.0, 57.0]);
+        let waves = barely_constrained(&Shifts(&cross), &[0.2; 5], [19, 19], [57.0, 57.0]).waves;
         assert!(waves.len() == MOST_WAVES);
         let depths: Vec<f64> = waves.iter().map(|wave| lambda(&cross, wave.vector)).collect();
         assert!(depths.is_sorted() && depths.iter().all(|depth| (0.0..DEEPEST).contains(depth)));
@@ -232,9 +241,11 @@ mod tests {
     fn what_is_undetermined_is_no_wave() {
         // Of two exposures, and of a lattice that leaves every other pixel out, λ is 0 at waves besides 0.
         let pair = [[0.0, 0.0], [3.0, 5.0]];
-        assert!(barely_constrained(&Shifts(&pair), &[0.5; 2], [3, 5], [9.0, 15.0]).is_empty());
+        assert!(
+            barely_constrained(&Shifts(&pair), &[0.5; 2], [3, 5], [9.0, 15.0]).waves.is_empty()
+        );
         let even = [[0.0, 0.0], [0.0, 2.0], [2.0, 0.0], [4.0, 2.0], [2.0, 6.0]];
-        for wave in barely_constrained(&Shifts(&even), &[0.2; 5], [4, 6], [12.0, 18.0]) {
+        for wave in barely_constrained(&Shifts(&even), &[0.2; 5], [4, 6], [12.0, 18.0]).waves {
             assert!(lambda(&even, wave.vector) > DETERMINED);
         }
     }
@@ -244,7 +255,7 @@ mod tests {
         // All row shifts even but one, of little weight.
         let shifts = [[0.0, 0.0], [2.0, 1.0], [4.0, 3.0], [2.0, 5.0], [1.0, 2.0]];
         let shares = [0.245, 0.245, 0.245, 0.245, 0.02];
-        let waves = barely_constrained(&Shifts(&shifts), &shares, [4, 5], [12.0, 15.0]);
+        let waves = barely_constrained(&Shifts(&shifts), &shares, [4, 5], [12.0, 15.0]).waves;
         let alone = waves.iter().find(|wave| wave.is_alone).unwrap();
         assert!(alone.vector[0].abs() == PI && alone.vector[1] == 0.0);
     }

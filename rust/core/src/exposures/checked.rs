@@ -312,15 +312,16 @@ impl<'a, T: Real> Exposures<'a, T> {
         Stretch::Weighted(values, weights)
     }
 
-    /// The weights of a row of `exposure` times `factor`, at most `largest`, to single precision.
+    /// The weights of columns of a row of `exposure` times a factor, at most a largest, to single precision.
     pub(crate) fn rough_weights(
         &self,
         exposure: usize,
         row: usize,
-        [factor, largest]: [f64; 2],
+        cols: Range<usize>,
+        scale: [f64; 2],
         weights: &mut [f32],
     ) {
-        weigh_roughly(&self.measurements, exposure, row, [factor, largest], weights);
+        weigh_roughly(&self.measurements, exposure, row, cols, scale, weights);
     }
 
     /// The weight of an exposure's measurements if it is the same for all and all are used.

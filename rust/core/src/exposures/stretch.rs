@@ -68,13 +68,14 @@ pub(super) fn weigh_roughly<T: Real>(
     measurements: &Measurements<'_, T>,
     exposure: usize,
     row: usize,
+    cols: Range<usize>,
     [factor, largest]: [f64; 2],
     weights: &mut [f32],
 ) {
     let (per, largest) = (1.0 / factor, largest as f32);
     // A quotient in single precision takes a quarter of the time of one in double precision.
     let inverse = |variance| (1.0 / (variance * per) as f32).min(largest);
-    fill(measurements, exposure, row, 0..weights.len(), weights, inverse);
+    fill(measurements, exposure, row, cols, weights, inverse);
 }
 
 fn fill<T: Real, W: Copy + Default>(
@@ -123,7 +124,7 @@ mod tests {
                     let measurements = Measurements { frames, variance, mask };
                     let (mut double, mut single) = (vec![9.0; width], vec![9.0_f32; width]);
                     let _ = weigh(&measurements, 0, 0, 0..width, &mut double);
-                    weigh_roughly(&measurements, 0, 0, [2.5, 1e12], &mut single);
+                    weigh_roughly(&measurements, 0, 0, 0..width, [2.5, 1e12], &mut single);
                     for i in 0..width {
                         let used = values[i].is_finite()
                             && !(masked[i] && matches!(mask, Mask::Pixels(_)));

@@ -139,7 +139,7 @@ fn seen<T: Real>(system: &System<'_, '_, T>, hats: &Hats) -> Vec<SeenWave> {
         places.clone().max().unwrap_or(0) - places.min().unwrap_or(0)
     });
     let spacing = [hats.rows.spacing, hats.cols.spacing];
-    let waves = barely_constrained(&taps, &shares, reach, spacing);
+    let waves = barely_constrained(&taps, &shares, reach, spacing).waves;
     let seen = waves.into_iter().map(|wave| {
         let [q, p] = wave.vector;
         let factor = |k: usize| times(taps.along(0, k, q), taps.along(1, k, p));

@@ -1,9 +1,11 @@
 //! The coarse spaces of S, with their matrices summed over blocks of beam cells.
 
+use std::f64::consts::PI;
+
 use super::operator::Reduced;
 use crate::coarse::{
-    Coarse, Complex, Entry, Hats, Modulated, SeenWave, Spot, Symbol, barely_constrained,
-    spacing_of_waves, times,
+    self, BarelyConstrained, Coarse, Complex, DEEPEST, Entry, Hats, Modulated, SeenWave, Spot,
+    Symbol, barely_constrained, spacing_of_waves, times,
 };
 use crate::control::Control;
 use crate::error::Result;
@@ -14,17 +16,77 @@ use crate::parallel::Workers;
 
 /// Blocks of cells along the distance of two hats.
 const BLOCKS: usize = 3;
-/// The hats with the coarse matrix of S, factorised, and those times waves that exposures barely constrain.
+/// Of more waves that are barely constrained, the deepest four are too few, and aggregates see them all.
+const MANY: f64 = 200.0;
+
+/// What sees the waves that exposures barely constrain.
+pub(super) enum Short {
+    /// Hats times the deepest of them, as a cell sees them: e^{−iq·d} of the pixel that sees it.
+    Waves(Vec<SeenWave>),
+    Aggregates,
+}
+
+impl Short {
+    /// That of these exposures. Where they are turned against each other no wave is seen as one.
+    pub(super) fn of<T: Real>(exposures: &Exposures<'_, T>) -> Self {
+        let geometry = exposures.geometry();
+        if geometry.views.len() > 1 {
+            return Self::Waves(Vec::new());
+        }
+        let places = Places(&geometry.placements);
+        let shares = exposures.shares();
+        let reach = [0, 1].map(|axis| {
+            let along = places.0.iter().map(|place| [place.row, place.col][axis]);
+            along.clone().max().unwrap_or(0) - along.min().unwrap_or(0)
+        });
+        let spacing = hats_of_waves(geometry);
+        let spacing = [spacing.rows.spacing, spacing.cols.spacing];
+        let BarelyConstrained { waves, share } =
+            barely_constrained(&places, &shares, reach, spacing);
+        // λ is below t in an ellipse around each minimum, of the share t/(4π √det Σ).
+        if 4.0 * PI * places.spread(&shares) * share / DEEPEST > MANY {
+            return Self::Aggregates;
+        }
+        let seen = waves.into_iter().map(|wave| {
+            let [q, p] = wave.vector;
+            let factor = |k: usize| times(places.along(0, k, q), places.along(1, k, p));
+            SeenWave { wave, factors: (0..places.0.len()).map(factor).collect(), penalty: 0.0 }
+        });
+        Self::Waves(seen.collect())
+    }
+
+    fn waves(&self) -> &[SeenWave] {
+        match self {
+            Self::Waves(waves) => waves,
+            Self::Aggregates => &[],
+        }
+    }
+}
+
+/// What the coarse spaces of these exposures take, in bytes: aggregates, for each place of the padded sensor,
+/// half as much again as measured for five positions, since their matrix grows with the number.
+pub(super) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>, places: u64) -> u64 {
+    let short = Short::of(exposures);
+    let of_aggregates = if let Short::Aggregates = short { 30 * places } else { 0 };
+    coarse::bytes_needed(exposures.geometry(), short.waves().len()) + of_aggregates
+}
+
+fn hats_of_waves(geometry: &Geometry) -> Hats {
+    Hats::new(geometry.sensor, spacing_of_waves(geometry))
+}
+
+/// The hats with the coarse matrix of S, factorised, and those times waves.
 ///
 /// # Errors
 /// [`Error::Cancelled`](crate::Error::Cancelled).
 pub(super) fn coarse_spaces<T: Real>(
     hats: &Hats,
-    geometry: &Geometry,
+    short: &Short,
     reduced: &Reduced<'_, '_, T>,
     workers: &Workers,
     control: &Control,
 ) -> Result<(Coarse, Modulated<f32>)> {
+    let geometry = reduced.exposures.geometry();
     let blocks = Blocks::new(hats, geometry);
     let weights = blocks.weights(geometry, reduced, workers, control)?;
     let entries = weights
@@ -33,11 +95,10 @@ pub(super) fn coarse_spaces<T: Real>(
         .map(|(block, weights)| blocks.entries(block, weights, hats, geometry));
     let coarse = Coarse::of_blocks(hats, &reduced.prior_of_hats(hats), &[], entries, control)?;
     control.check()?;
-    let finer = Hats::new(geometry.sensor, spacing_of_waves(geometry));
+    let finer = hats_of_waves(geometry);
     // What a prior holds is no wave.
-    let without = reduced.weak.is_some();
-    let seen = if without { Vec::new() } else { seen(reduced.exposures, &finer) };
-    let spots: Vec<Vec<Spot>> = match &seen[..] {
+    let seen = if reduced.weak.is_some() { &[] } else { short.waves() };
+    let spots: Vec<Vec<Spot>> = match seen {
         [] => Vec::new(),
         _ => weights
             .chunks_exact(geometry.placements.len())
@@ -45,38 +106,25 @@ pub(super) fn coarse_spaces<T: Real>(
             .map(|(block, weights)| blocks.spots(block, weights, &finer, geometry))
             .collect(),
     };
-    let waves = Modulated::new(finer, geometry.sensor.rows, &seen, &spots, workers);
+    let waves = Modulated::new(finer, geometry.sensor.rows, seen, &spots, workers);
     Ok((coarse, waves))
 }
 
-/// How many waves the coarse space of these exposures has.
-pub(super) fn count_waves<T: Real>(exposures: &Exposures<'_, T>) -> usize {
-    let geometry = exposures.geometry();
-    seen(exposures, &Hats::new(geometry.sensor, spacing_of_waves(geometry))).len()
-}
-
-/// The waves that the exposures barely constrain, as a cell sees them: e^{−iq·d} of the pixel that sees it.
-/// Where exposures are turned against each other no wave is seen as one.
-fn seen<T: Real>(exposures: &Exposures<'_, T>, hats: &Hats) -> Vec<SeenWave> {
-    if exposures.geometry().views.len() > 1 {
-        return Vec::new();
-    }
-    let places = Places(&exposures.geometry().placements);
-    let shares = exposures.shares();
-    let reach = [0, 1].map(|axis| {
-        let along = places.0.iter().map(|place| [place.row, place.col][axis]);
-        along.clone().max().unwrap_or(0) - along.min().unwrap_or(0)
-    });
-    let waves = barely_constrained(&places, &shares, reach, [hats.rows.spacing, hats.cols.spacing]);
-    let seen = waves.into_iter().map(|wave| {
-        let [q, p] = wave.vector;
-        let factor = |k: usize| times(places.along(0, k, q), places.along(1, k, p));
-        SeenWave { wave, factors: (0..places.0.len()).map(factor).collect(), penalty: 0.0 }
-    });
-    seen.collect()
-}
-
 struct Places<'p>(&'p [Placement]);
+
+impl Places<'_> {
+    /// √det Σ, with Σ the covariance of the shifts.
+    fn spread(&self, shares: &[f64]) -> f64 {
+        let at = |place: &Placement| [place.row as f64, place.col as f64];
+        let mean = |value: &dyn Fn([f64; 2]) -> f64| -> f64 {
+            self.0.iter().zip(shares).map(|(place, share)| share * value(at(place))).sum()
+        };
+        let [row, col] = [0, 1].map(|axis| mean(&|at| at[axis]));
+        let of = |i: usize, j: usize| mean(&|at| (at[i] - [row, col][i]) * (at[j] - [row, col][j]));
+        // Of shifts on a line rounding may leave less than 0.
+        (of(0, 0) * of(1, 1) - of(0, 1).powi(2)).max(0.0).sqrt()
+    }
+}
 
 impl Symbol for Places<'_> {
     fn along(&self, axis: usize, exposure: usize, q: f64) -> Complex {

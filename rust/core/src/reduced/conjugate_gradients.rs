@@ -4,10 +4,10 @@
 //! Lanczos, whose eigenvalues, the Ritz values, approach those of P⁻¹S from within; the smallest is
 //! what turns a residual into an estimate of the error ([`Smallest`], and [`convergence`](crate::convergence)).
 
-use super::blocks::count_waves;
+use super::blocks;
 use super::operator::Reduced;
 use super::two_level::TwoLevel;
-use crate::coarse::{self, DAMPING};
+use crate::coarse::DAMPING;
 use crate::control::Control;
 use crate::convergence::{FEWEST_ITERATIONS, ROUNDING};
 use crate::error::Result;
@@ -33,6 +33,7 @@ const UNRESOLVED: f64 = 4e-12;
 /// |---|---|
 /// | x, residual, direction, product; M and 1/D in single precision | 6 · 4 for each place of the sensor |
 /// | L², h | 2 · 4 for each place of each view |
+/// | aggregates and their matrices, where they take the place of waves | 30 for each place of the sensor |
 /// | the coarse matrices and their factors | some 2700 for each hat, 8000 for one of a wave, or of a full matrix |
 pub(crate) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>) -> u64 {
     let geometry = exposures.geometry();
@@ -41,7 +42,7 @@ pub(crate) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>) -> u64 {
     let of_views: u64 = geometry.views.iter().map(|view| 8 * places(view.shape.rows)).sum();
     24 * places(geometry.sensor.rows)
         + of_views
-        + coarse::bytes_needed(geometry, count_waves(exposures))
+        + blocks::bytes_needed(exposures, places(geometry.sensor.rows))
 }
 
 /// A solution in the making: all that it needs stays in one place from one problem to the next.
@@ -118,7 +119,7 @@ impl<'m, 'a, T: Real> ConjugateGradients<'m, 'a, T> {
         control: &Control,
     ) -> Result<()> {
         self.reduced.linearise(sensitivity, beams, prior, control)?;
-        self.two_level.prepare(&self.reduced, control)
+        self.two_level.prepare(&mut self.reduced, control)
     }
 
     pub(crate) const fn workers(&self) -> &'m Workers {

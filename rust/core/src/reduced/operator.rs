@@ -400,8 +400,33 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         }
         scratch.resize(2 * self.padding.lead + self.padding.width, 0.0);
         let weights = &mut scratch[self.padding.lead..][..self.exposures.sensor().cols];
-        self.exposures.rough_weights(exposure, row, [factor, LARGEST], weights);
+        let cols = 0..weights.len();
+        self.exposures.rough_weights(exposure, row, cols, [factor, LARGEST], weights);
         RowWeight::Padded(scratch)
+    }
+
+    /// w c² of each exposure whose measurements all have the same weight.
+    pub(super) fn uniform_weights(&self) -> Vec<Option<f32>> {
+        let weights = self.exposures.flux().iter().enumerate().map(|(exposure, flux)| {
+            let weight = self.exposures.uniform_weight(exposure)?;
+            Some((weight * flux.powi(2) / self.scale.weight).min(LARGEST) as f32)
+        });
+        weights.collect()
+    }
+
+    /// w c² of a measurement of a pixel of the padded image.
+    pub(super) fn weight_of(&self, exposure: usize, pixel: usize) -> f32 {
+        let place = pixel - self.padding.lead;
+        let (row, col) = (place / self.padding.width, place % self.padding.width);
+        let factor = self.exposures.flux()[exposure].powi(2) / self.scale.weight;
+        let mut weight = [0.0];
+        self.exposures.rough_weights(exposure, row, col..col + 1, [factor, LARGEST], &mut weight);
+        weight[0]
+    }
+
+    /// L² h of a cell of the only view, where h is what the last elimination left there.
+    pub(super) fn share_of_cell(&self, cell: usize) -> f32 {
+        self.light[0][cell] * self.eliminated[0][cell]
     }
 
     pub(crate) fn scratch(&self) -> Scratch {

@@ -20,8 +20,12 @@
 //! Each block adds a positive semidefinite part in which constants weigh nothing, so A is one too.
 //! A slight ridge makes it definite: what it is not definite in, by constants in pieces that do not
 //! hang together or by shifts along one line only, is no error that S can see.
+//!
+//! What exposures barely constrain besides is not smooth, and has columns of its own: hats times its
+//! deepest waves, or aggregates of pixels where its waves are many ([`Short`]).
 
-use super::blocks::coarse_spaces;
+use super::aggregated::Aggregated;
+use super::blocks::{Short, coarse_spaces};
 use super::operator::Reduced;
 use super::two_level_kernel::{Close, Descend, Direction};
 use crate::coarse::{Coarse, DAMPING, Hats, Modulated, spacing};
@@ -29,24 +33,24 @@ use crate::control::Control;
 use crate::error::Result;
 use crate::exposures::Exposures;
 use crate::frames::Real;
-use crate::geometry::Geometry;
 use crate::padded::{BAND, Padding};
 use crate::parallel::Workers;
 
 /// The preconditioner, at the weights for which it was made.
 pub(crate) struct TwoLevel<'m> {
     workers: &'m Workers,
-    geometry: &'m Geometry,
     padding: Padding,
     hats: Hats,
+    short: Short,
     coarse: Option<Coarse>,
     /// One value a hat: Φᵀ r, then the heights y.
     heights: Vec<f64>,
     /// Those heights along the rows of the coarse grid, at every column of the sensor.
     spread: Vec<f32>,
-    /// Hats times waves, and likewise their heights.
+    /// Hats times waves, or aggregates, and their heights; those of waves likewise along rows.
     waves: Option<Modulated<f32>>,
-    lines: Vec<f32>,
+    aggregated: Option<Aggregated>,
+    fine: Vec<f32>,
 }
 
 impl<'m> TwoLevel<'m> {
@@ -60,8 +64,18 @@ impl<'m> TwoLevel<'m> {
         let hats = Hats::new(exposures.sensor(), spacing(geometry));
         let spread = vec![0.0; hats.rows.nodes * padding.width];
         let heights = vec![0.0; hats.count()];
-        let (coarse, waves, lines) = (None, None, Vec::new());
-        Self { workers, geometry, padding, hats, coarse, heights, spread, waves, lines }
+        Self {
+            workers,
+            padding,
+            hats,
+            short: Short::of(exposures),
+            coarse: None,
+            heights,
+            spread,
+            waves: None,
+            aggregated: None,
+            fine: Vec::new(),
+        }
     }
 
     /// Sums and factorises the coarse matrix, unless that has been done at other weights: it need
@@ -71,21 +85,24 @@ impl<'m> TwoLevel<'m> {
     /// [`Error::Cancelled`](crate::Error::Cancelled).
     pub(crate) fn prepare<T: Real>(
         &mut self,
-        reduced: &Reduced<'_, '_, T>,
+        reduced: &mut Reduced<'_, '_, T>,
         control: &Control,
     ) -> Result<()> {
         if self.coarse.is_none() {
-            let Self { hats, geometry, workers, .. } = self;
-            let (coarse, waves) = coarse_spaces(hats, geometry, reduced, workers, control)?;
+            let Self { hats, short, workers, .. } = self;
+            let (coarse, waves) = coarse_spaces(hats, short, reduced, workers, control)?;
             self.coarse = Some(coarse);
             self.waves = Some(waves).filter(|waves| !waves.is_empty());
+            if let Short::Aggregates = short {
+                self.aggregated = Some(Aggregated::new(reduced, workers, control)?);
+            }
         }
         Ok(())
     }
 
     /// Has it made anew.
     pub(crate) fn forget(&mut self) {
-        (self.coarse, self.waves) = (None, None);
+        (self.coarse, self.waves, self.aggregated) = (None, None, None);
     }
 
     /// Whether large scales are in it: without a factor of the coarse matrix nothing sees them.
@@ -146,16 +163,16 @@ impl<'m> TwoLevel<'m> {
                 }
             }
         }
-        let Self { workers, padding, hats, coarse, heights, spread, waves, .. } = self;
+        let Self { workers, padding, hats, coarse, heights, spread, waves, aggregated, .. } = self;
         let of_hats = || solve_hats(hats, coarse.as_ref(), heights, spread, padding.width, workers);
-        let waves =
-            || waves.as_ref().map(|waves| solve_waves(waves, of_waves, padding.width, workers));
-        let (by_hats, found) = workers.both(of_hats, waves);
-        let mut by_waves = 0.0;
-        if let Some(found) = found {
-            (by_waves, self.lines) = found;
-        }
-        by_diagonal + by_waves + by_hats
+        let of_fine = || match (waves, aggregated) {
+            (Some(waves), _) => solve_waves(waves, of_waves, padding.width, workers),
+            (None, Some(aggregated)) => aggregated.solve(residual, &reduced.sensitivity, workers),
+            (None, None) => (0.0, Vec::new()),
+        };
+        let (by_hats, (by_fine, fine)) = workers.both(of_hats, of_fine);
+        self.fine = fine;
+        by_diagonal + by_fine + by_hats
     }
 
     /// x ← x + a p, then p ← P⁻¹ r + b p for the r of the last [`descend`](Self::descend); returns
@@ -173,7 +190,10 @@ impl<'m> TwoLevel<'m> {
         let bands = self.workers.map_pairs(x, direction, [size; 2], |band, x, direction| {
             let mut modulated = vec![0.0; x.len()];
             if let Some(waves) = &self.waves {
-                waves.spread(&self.lines, band * BAND, &mut modulated, padding.width);
+                waves.spread(&self.fine, band * BAND, &mut modulated, padding.width);
+            }
+            if let Some(aggregated) = &self.aggregated {
+                aggregated.spread(&self.fine, band * BAND, &mut modulated);
             }
             let rows = x.chunks_exact_mut(padding.width);
             let rows = rows.zip(direction.chunks_exact_mut(padding.width)).enumerate();

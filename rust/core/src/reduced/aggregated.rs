@@ -1,0 +1,188 @@
+//! The aggregates of pixels of S, with their matrix.
+
+use super::operator::{Input, Reduced};
+use crate::coarse::{Cycle, Edges, Graph, NONE, Partition};
+use crate::control::Control;
+use crate::error::Result;
+use crate::frames::Real;
+use crate::padded::Padding;
+use crate::parallel::Workers;
+
+/// The factor of what aggregates find, since the diagonal and the hats see a part of it too.
+const DAMPING: f64 = 0.5;
+
+/// Aggregates of pixels.
+pub(super) struct Aggregated {
+    padding: Padding,
+    pixels: Partition,
+    cycle: Cycle,
+}
+
+impl Aggregated {
+    /// Those of S at its M and L, for exposures of one orientation.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](crate::Error::Cancelled).
+    pub(super) fn new<T: Real>(
+        reduced: &mut Reduced<'_, '_, T>,
+        workers: &Workers,
+        control: &Control,
+    ) -> Result<Self> {
+        let (pixels, graph) = graph(reduced, workers, control)?;
+        Ok(Self { padding: reduced.padding, pixels, cycle: Cycle::new(graph, workers, control)? })
+    }
+
+    /// The product of Φᵀ r and the heights that follow from it, and these.
+    pub(super) fn solve(
+        &self,
+        residual: &[f32],
+        sensitivity: &[f32],
+        workers: &Workers,
+    ) -> (f64, Vec<f32>) {
+        let of = |pixel: usize| f64::from(residual[pixel] * sensitivity[pixel]);
+        let right = self.pixels.sums(of, workers);
+        let heights = self.cycle.solve(&right, workers);
+        let product = right.iter().zip(&heights).map(|(b, y)| DAMPING * b * y).sum();
+        (product, heights.into_iter().map(|y| (DAMPING * y) as f32).collect())
+    }
+
+    /// Heights at rows of pixels from `first` on.
+    pub(super) fn spread(&self, heights: &[f32], first: usize, values: &mut [f32]) {
+        let pixels = &self.padding.body(&self.pixels.of)[first * self.padding.width..];
+        for (value, &aggregate) in values.iter_mut().zip(pixels) {
+            *value = if aggregate == NONE { 0.0 } else { heights[aggregate as usize] };
+        }
+    }
+}
+
+/// The aggregates, and their matrix Φᵀ S Φ.
+fn graph<T: Real>(
+    reduced: &mut Reduced<'_, '_, T>,
+    workers: &Workers,
+    control: &Control,
+) -> Result<(Partition, Graph)> {
+    reduced.eliminate(Input::Weight, control);
+    control.check()?;
+    let reduced = &*reduced;
+    let places = &reduced.exposures.geometry().placements;
+    let places: Vec<usize> =
+        places.iter().map(|place| place.row * reduced.padding.width + place.col).collect();
+    let mut apart: Vec<usize> = places
+        .iter()
+        .flat_map(|one| places.iter().map(|other| one.wrapping_sub(*other)))
+        .filter(|&apart| apart != 0)
+        .collect();
+    apart.sort_unstable();
+    apart.dedup();
+    let inverse = &reduced.inverse_diagonal;
+    let beside = |pixel: usize| apart.iter().map(move |apart| (pixel.wrapping_add(*apart), 1.0));
+    let is_used = |pixel: usize| inverse[pixel] > 0.0;
+    let pixels = Partition::stars(inverse.len(), is_used, beside, control)?;
+    let uniform = reduced.uniform_weights();
+    let edges = Pixels { reduced, places, pixels: &pixels, uniform };
+    let graph = pixels.graph(&edges, workers, control)?;
+    Ok((pixels, graph))
+}
+
+/// The pixels that see a cell are compared with each other: Ω_k Ω_l / Σ Ω, with Ω = w c² L² M².
+struct Pixels<'r, 'm, 'a, T> {
+    reduced: &'r Reduced<'m, 'a, T>,
+    /// How far behind a pixel the cell stands that an exposure sees there.
+    places: Vec<usize>,
+    pixels: &'r Partition,
+    /// w c² of exposures where it is the same for all measurements.
+    uniform: Vec<Option<f32>>,
+}
+
+impl<T: Real> Pixels<'_, '_, '_, T> {
+    /// w c² M².
+    fn weight(&self, exposure: usize, pixel: usize) -> f32 {
+        let weight = self.uniform[exposure];
+        let weight = weight.unwrap_or_else(|| self.reduced.weight_of(exposure, pixel));
+        weight * self.reduced.sensitivity[pixel].powi(2)
+    }
+}
+
+impl<T: Real> Edges for Pixels<'_, '_, '_, T> {
+    fn of(&self, pixel: usize, mut add: impl FnMut(usize, f64)) {
+        for (exposure, place) in self.places.iter().enumerate() {
+            let cell = pixel + place;
+            let seen = self.reduced.share_of_cell(cell) * self.weight(exposure, pixel);
+            if seen == 0.0 {
+                continue;
+            }
+            for (beside, place) in self.places.iter().enumerate() {
+                // Before the first pixel there is none.
+                let other = cell.wrapping_sub(*place);
+                if self.pixels.of.get(other).is_some_and(|&of| of != NONE) {
+                    add(other, f64::from(seen * self.weight(beside, other)));
+                }
+            }
+        }
+    }
+
+    fn own(&self, pixel: usize) -> f64 {
+        let m = f64::from(self.reduced.sensitivity[pixel]);
+        let prior = self.reduced.weak.as_ref();
+        prior.map_or(0.0, |prior| f64::from(prior.weights[pixel]) * m * m)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::exposures::{Exposures, Flux, Mask, Measurements, Positions, Variance};
+    use crate::frames::{Shape, Stack};
+    use crate::reduced::ConjugateGradients;
+    use crate::testing::random_number;
+
+    const SENSOR: Shape = Shape::new(23, 31);
+    /// Far apart, so that pixels see cells alone, and one cell of two exposures each in places.
+    const SHIFTS: [[f64; 2]; 4] = [[0.0, 0.0], [7.0, -12.0], [-9.0, 5.0], [3.0, 16.0]];
+
+    #[test]
+    fn the_matrix_is_that_of_the_columns() {
+        let (workers, control) = (Workers::new(None).unwrap(), Control::new());
+        let positive = |seed: usize| 1.0 + 0.4 * random_number(seed);
+        let count = SHIFTS.len() * SENSOR.len();
+        let frames: Vec<f64> = (0..count).map(positive).collect();
+        let variance: Vec<f64> = (0..count).map(|at| 1e-3 * positive(at + 99_000)).collect();
+        let masked: Vec<bool> = (0..count).map(|at| random_number(at + 5) > 0.9).collect();
+        let stack = |values| Stack::new("frames", values, SHIFTS.len(), SENSOR).unwrap();
+        let whole = [Variance::Unknown, Variance::Exposures(&[4e-6, 9e-5, 5e-7, 1e-6])];
+        let cases = [
+            (whole[0], Mask::None),
+            (whole[1], Mask::None),
+            (whole[1], Mask::Measurements(&masked)),
+            (Variance::Measurements(stack(&variance)), Mask::Measurements(&masked)),
+        ];
+        for (variance, mask) in cases {
+            let measurements = Measurements { frames: stack(&frames), variance, mask };
+            let flux = Flux::steady(SHIFTS.len());
+            let positions = Positions::of_shifts(&SHIFTS);
+            let exposures =
+                Exposures::new(measurements, positions, flux, false, &workers, &control).unwrap();
+            let mut solver = ConjugateGradients::new(&exposures, &workers, &control);
+            let sensitivity: Vec<f64> = (0..SENSOR.len()).map(|at| positive(at + 7)).collect();
+            let cells = exposures.geometry().views[0].shape.len();
+            let beams = [(0..cells).map(|at| positive(at + 4321)).collect()];
+            solver.linearise(&sensitivity, &beams, None, &control).unwrap();
+            let reduced = &mut solver.reduced;
+            let (pixels, graph) = graph(reduced, &workers, &control).unwrap();
+            assert!(pixels.count() > 20 && pixels.count() < SENSOR.len() / 3);
+            let heights: Vec<f64> = (0..pixels.count()).map(|at| random_number(at + 11)).collect();
+            let x: Vec<f32> = pixels
+                .of
+                .iter()
+                .zip(&reduced.sensitivity)
+                .map(|(&of, m)| if of == NONE { 0.0 } else { m * heights[of as usize] as f32 })
+                .collect();
+            let mut product = vec![0.0; x.len()];
+            let wanted = reduced.multiply(&x, &mut product, &control).unwrap();
+            let left = graph.residual(&vec![0.0; heights.len()], &heights, &workers);
+            let found: f64 = left.iter().zip(&heights).map(|(left, y)| -left * y).sum();
+            // Single precision, and the product is a difference of sums some times as large.
+            assert!((found / wanted - 1.0).abs() < 1e-5, "{found} {wanted}");
+        }
+    }
+}
