@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import time
@@ -12,6 +13,20 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 Row = tuple[str, str, str, str]
+
+OBSERVED = """
+import atexit, os, runpy, sys
+from pathlib import Path
+
+def tell():
+    os.write(told, Path("/proc/self/status").read_bytes())
+
+told = int(sys.argv.pop(1))
+atexit.register(tell)
+runpy.run_module("equipix", run_name="__main__", alter_sys=True)
+"""
+"""Runs equipix and tells of itself at the end. What the system counts for a child begins with the
+peak of its parent."""
 
 
 class Cost(NamedTuple):
@@ -24,19 +39,25 @@ class Cost(NamedTuple):
 
 def measure(arguments: tuple[str, ...], folder: Path | None = None) -> Cost:
     """Run a command of equipix, without what it prints of its result."""
+    heard, told = os.pipe()
     start = time.perf_counter()
     child = subprocess.Popen(
-        [sys.executable, "-m", "equipix", *arguments],
+        [sys.executable, "-c", OBSERVED, str(told), *arguments],
         cwd=folder,
         stdout=subprocess.DEVNULL,
+        pass_fds=[told],
         env={**os.environ, "PYTHONWARNINGS": "ignore"},
     )
+    os.close(told)
+    with os.fdopen(heard) as pipe:
+        state = pipe.read()
     _, status, used = os.wait4(child.pid, 0)
     seconds = time.perf_counter() - start
     child.returncode = os.waitstatus_to_exitcode(status)
     if child.returncode:
         raise subprocess.CalledProcessError(child.returncode, child.args)
-    return Cost(seconds, used.ru_utime + used.ru_stime, 1024 * used.ru_maxrss / 1e9)
+    peak = re.findall(r"VmHWM:\s+(\d+)", state)[0]
+    return Cost(seconds, used.ru_utime + used.ru_stime, 1024 * int(peak) / 1e9)
 
 
 class Command(NamedTuple):
