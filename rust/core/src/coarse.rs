@@ -12,7 +12,8 @@
 //! A slight ridge makes it definite: what it is not definite in, by constants in pieces that are not
 //! connected or by shifts along one line only, is no error that S can see.
 
-mod aggregates;
+mod cycle;
+mod graph;
 mod hats;
 mod matrix;
 mod modulated;
@@ -21,7 +22,8 @@ mod modulated_matrix;
 mod spacing;
 mod spectrum;
 
-pub(crate) use aggregates::{Cycle, Edges, Graph, NONE, Partition};
+pub(crate) use cycle::Cycle;
+pub(crate) use graph::{Edges, Graph, NONE, Partition, STRONG};
 pub(crate) use hats::Hats;
 pub(crate) use matrix::{Coarse, Entry};
 pub(crate) use modulated::Modulated;

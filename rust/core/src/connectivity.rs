@@ -65,7 +65,11 @@ impl DisjointSets {
 }
 
 /// Calls `visit` for 0, 1, … `count` − 1, and looks now and then whether to stop.
-fn in_parts(count: usize, control: &Control, mut visit: impl FnMut(usize)) -> Result<()> {
+pub(crate) fn in_parts(
+    count: usize,
+    control: &Control,
+    mut visit: impl FnMut(usize),
+) -> Result<()> {
     for start in (0..count).step_by(CHECK_EVERY) {
         control.check()?;
         (start..count.min(start + CHECK_EVERY)).for_each(&mut visit);

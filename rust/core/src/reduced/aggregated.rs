@@ -1,7 +1,7 @@
 //! The aggregates of pixels of S, with their matrix.
 
 use super::operator::{Input, Reduced};
-use crate::coarse::{Cycle, Edges, Graph, NONE, Partition};
+use crate::coarse::{Cycle, Edges, Graph, NONE, Partition, STRONG};
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
@@ -67,21 +67,33 @@ fn graph<T: Real>(
     let places = &reduced.exposures.geometry().placements;
     let places: Vec<usize> =
         places.iter().map(|place| place.row * reduced.padding.width + place.col).collect();
-    let mut apart: Vec<usize> = places
-        .iter()
-        .flat_map(|one| places.iter().map(|other| one.wrapping_sub(*other)))
-        .filter(|&apart| apart != 0)
-        .collect();
-    apart.sort_unstable();
-    apart.dedup();
     let inverse = &reduced.inverse_diagonal;
+    let apart = apart(&places, &reduced.exposures.shares());
     let beside = |pixel: usize| apart.iter().map(move |apart| (pixel.wrapping_add(*apart), 1.0));
     let is_used = |pixel: usize| inverse[pixel] > 0.0;
-    let pixels = Partition::stars(inverse.len(), is_used, beside, control)?;
-    let uniform = reduced.uniform_weights();
+    let pixels = Partition::neighbourhoods(inverse.len(), is_used, beside, control)?;
+    let uniform = (0..places.len()).map(|exposure| reduced.uniform_weight(exposure)).collect();
     let edges = Pixels { reduced, places, pixels: &pixels, uniform };
     let graph = pixels.graph(&edges, workers, control)?;
     Ok((pixels, graph))
+}
+
+/// How far apart pixels are, in a padded image, that see a cell in two exposures whose weights make the
+/// comparison count: in what they barely constrain such pixels are nearly alike.
+fn apart(places: &[usize], shares: &[f64]) -> Vec<usize> {
+    let seen = || places.iter().zip(shares).enumerate();
+    let pairs = || seen().flat_map(|one| seen().map(move |other| (one, other)));
+    let pairs = || pairs().filter(|((one, _), (other, _))| one != other);
+    let weight = |one: &f64, other: &f64| one * other;
+    let heaviest = pairs().map(|((_, one), (_, other))| weight(one.1, other.1)).fold(0.0, f64::max);
+    let strong =
+        pairs().filter(|((_, one), (_, other))| weight(one.1, other.1) >= STRONG * heaviest);
+    let mut apart: Vec<usize> =
+        strong.map(|((_, one), (_, other))| one.0.wrapping_sub(*other.0)).collect();
+    apart.sort_unstable();
+    apart.dedup();
+    apart.retain(|&apart| apart != 0);
+    apart
 }
 
 /// The pixels that see a cell are compared with each other: Ω_k Ω_l / Σ Ω, with Ω = w c² L² M².
@@ -108,14 +120,18 @@ impl<T: Real> Edges for Pixels<'_, '_, '_, T> {
         for (exposure, place) in self.places.iter().enumerate() {
             let cell = pixel + place;
             let seen = self.reduced.share_of_cell(cell) * self.weight(exposure, pixel);
-            if seen == 0.0 {
+            // Of a cell that only the weakest measurements see, 1/Σ w c² M² may be infinite.
+            if !(seen > 0.0 && seen.is_finite()) {
                 continue;
             }
             for (beside, place) in self.places.iter().enumerate() {
                 // Before the first pixel there is none.
                 let other = cell.wrapping_sub(*place);
                 if self.pixels.of.get(other).is_some_and(|&of| of != NONE) {
-                    add(other, f64::from(seen * self.weight(beside, other)));
+                    let weight = seen * self.weight(beside, other);
+                    if weight > 0.0 {
+                        add(other, f64::from(weight));
+                    }
                 }
             }
         }
@@ -131,7 +147,7 @@ impl<T: Real> Edges for Pixels<'_, '_, '_, T> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::exposures::{Exposures, Flux, Mask, Measurements, Positions, Variance};
+    use crate::exposures::{Exposures, Flux, FluxKind, Mask, Measurements, Positions, Variance};
     use crate::frames::{Shape, Stack};
     use crate::reduced::ConjugateGradients;
     use crate::testing::random_number;
@@ -158,18 +174,20 @@ mod tests {
         ];
         for (variance, mask) in cases {
             let measurements = Measurements { frames: stack(&frames), variance, mask };
-            let flux = Flux::steady(SHIFTS.len());
+            let flux = Flux { values: vec![1.0, 0.7, 1.6, 0.4], kind: FluxKind::Known };
             let positions = Positions::of_shifts(&SHIFTS);
             let exposures =
                 Exposures::new(measurements, positions, flux, false, &workers, &control).unwrap();
             let mut solver = ConjugateGradients::new(&exposures, &workers, &control);
-            let sensitivity: Vec<f64> = (0..SENSOR.len()).map(|at| positive(at + 7)).collect();
+            // Every ninth pixel is dead.
+            let of = |at: usize| if at.is_multiple_of(9) { 0.0 } else { positive(at + 7) };
+            let sensitivity: Vec<f64> = (0..SENSOR.len()).map(of).collect();
             let cells = exposures.geometry().views[0].shape.len();
             let beams = [(0..cells).map(|at| positive(at + 4321)).collect()];
             solver.linearise(&sensitivity, &beams, None, &control).unwrap();
             let reduced = &mut solver.reduced;
             let (pixels, graph) = graph(reduced, &workers, &control).unwrap();
-            assert!(pixels.count() > 20 && pixels.count() < SENSOR.len() / 3);
+            assert!(pixels.count() > 20 && pixels.count() < SENSOR.len() / 2);
             let heights: Vec<f64> = (0..pixels.count()).map(|at| random_number(at + 11)).collect();
             let x: Vec<f32> = pixels
                 .of

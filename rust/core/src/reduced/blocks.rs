@@ -16,17 +16,20 @@ use crate::parallel::Workers;
 
 /// Blocks of cells along the distance of two hats.
 const BLOCKS: usize = 3;
-/// Of more waves that are barely constrained, the deepest four are too few, and aggregates see them all.
-const MANY: f64 = 200.0;
+/// Of more waves that are barely constrained the deepest four are too few, and aggregates see them all.
+const MANY: f64 = 150.0;
+/// The share of wave vectors at which λ is small where waves have no minima of their own, as with one exposure
+/// of nearly all the weight.
+const MOST: f64 = 0.5;
 
 /// What sees the waves that exposures barely constrain.
-pub(super) enum Short {
+pub(super) enum ShortWaves {
     /// Hats times the deepest of them, as a cell sees them: e^{−iq·d} of the pixel that sees it.
     Waves(Vec<SeenWave>),
     Aggregates,
 }
 
-impl Short {
+impl ShortWaves {
     /// That of these exposures. Where they are turned against each other no wave is seen as one.
     pub(super) fn of<T: Real>(exposures: &Exposures<'_, T>) -> Self {
         let geometry = exposures.geometry();
@@ -43,8 +46,9 @@ impl Short {
         let spacing = [spacing.rows.spacing, spacing.cols.spacing];
         let BarelyConstrained { waves, share } =
             barely_constrained(&places, &shares, reach, spacing);
-        // λ is below t in an ellipse around each minimum, of the share t/(4π √det Σ).
-        if 4.0 * PI * places.spread(&shares) * share / DEEPEST > MANY {
+        // λ is below t in an ellipse around each minimum, of the share t/(4π √det Σ) where it is deep.
+        let count = 4.0 * PI * places.spread(&shares) * share / DEEPEST;
+        if count > MANY && share < MOST {
             return Self::Aggregates;
         }
         let seen = waves.into_iter().map(|wave| {
@@ -63,11 +67,12 @@ impl Short {
     }
 }
 
-/// What the coarse spaces of these exposures take, in bytes: aggregates, for each place of the padded sensor,
-/// half as much again as measured for five positions, since their matrix grows with the number.
+/// What the coarse spaces of these exposures take, in bytes: those of aggregates for each place of the padded
+/// sensor, where 18 were measured for five positions. Their matrix grows with the number.
 pub(super) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>, places: u64) -> u64 {
-    let short = Short::of(exposures);
-    let of_aggregates = if let Short::Aggregates = short { 30 * places } else { 0 };
+    let short = ShortWaves::of(exposures);
+    let each = 12 + 4 * exposures.count() as u64;
+    let of_aggregates = if let ShortWaves::Aggregates = short { each * places } else { 0 };
     coarse::bytes_needed(exposures.geometry(), short.waves().len()) + of_aggregates
 }
 
@@ -81,7 +86,7 @@ fn hats_of_waves(geometry: &Geometry) -> Hats {
 /// [`Error::Cancelled`](crate::Error::Cancelled).
 pub(super) fn coarse_spaces<T: Real>(
     hats: &Hats,
-    short: &Short,
+    short: &ShortWaves,
     reduced: &Reduced<'_, '_, T>,
     workers: &Workers,
     control: &Control,

@@ -394,33 +394,35 @@ impl<'m, 'a, T: Real> Reduced<'m, 'a, T> {
         row: usize,
         scratch: &'s mut Vec<f32>,
     ) -> RowWeight<'s> {
-        let factor = self.exposures.flux()[exposure].powi(2) / self.scale.weight;
-        if let Some(weight) = self.exposures.uniform_weight(exposure) {
-            return RowWeight::Same((weight * factor).min(LARGEST) as f32);
+        if let Some(weight) = self.uniform_weight(exposure) {
+            return RowWeight::Same(weight);
         }
         scratch.resize(2 * self.padding.lead + self.padding.width, 0.0);
         let weights = &mut scratch[self.padding.lead..][..self.exposures.sensor().cols];
         let cols = 0..weights.len();
-        self.exposures.rough_weights(exposure, row, cols, [factor, LARGEST], weights);
+        self.exposures.rough_weights(exposure, row, cols, self.factor(exposure), weights);
         RowWeight::Padded(scratch)
     }
 
-    /// w c² of each exposure whose measurements all have the same weight.
-    pub(super) fn uniform_weights(&self) -> Vec<Option<f32>> {
-        let weights = self.exposures.flux().iter().enumerate().map(|(exposure, flux)| {
-            let weight = self.exposures.uniform_weight(exposure)?;
-            Some((weight * flux.powi(2) / self.scale.weight).min(LARGEST) as f32)
-        });
-        weights.collect()
+    /// What a weight of an exposure is multiplied by, and the most that it may be then.
+    fn factor(&self, exposure: usize) -> [f64; 2] {
+        [self.exposures.flux()[exposure].powi(2) / self.scale.weight, LARGEST]
+    }
+
+    /// w c² of an exposure whose measurements all have the same weight.
+    pub(super) fn uniform_weight(&self, exposure: usize) -> Option<f32> {
+        let [factor, largest] = self.factor(exposure);
+        let weight = self.exposures.uniform_weight(exposure)?;
+        Some((weight * factor).min(largest) as f32)
     }
 
     /// w c² of a measurement of a pixel of the padded image.
     pub(super) fn weight_of(&self, exposure: usize, pixel: usize) -> f32 {
         let place = pixel - self.padding.lead;
         let (row, col) = (place / self.padding.width, place % self.padding.width);
-        let factor = self.exposures.flux()[exposure].powi(2) / self.scale.weight;
         let mut weight = [0.0];
-        self.exposures.rough_weights(exposure, row, col..col + 1, [factor, LARGEST], &mut weight);
+        let factor = self.factor(exposure);
+        self.exposures.rough_weights(exposure, row, col..col + 1, factor, &mut weight);
         weight[0]
     }
 

@@ -22,10 +22,10 @@
 //! hang together or by shifts along one line only, is no error that S can see.
 //!
 //! What exposures barely constrain besides is not smooth, and has columns of its own: hats times its
-//! deepest waves, or aggregates of pixels where its waves are many ([`Short`]).
+//! deepest waves, or aggregates of pixels where its waves are many (`ShortWaves`).
 
 use super::aggregated::Aggregated;
-use super::blocks::{Short, coarse_spaces};
+use super::blocks::{ShortWaves, coarse_spaces};
 use super::operator::Reduced;
 use super::two_level_kernel::{Close, Descend, Direction};
 use crate::coarse::{Coarse, DAMPING, Hats, Modulated, spacing};
@@ -41,7 +41,7 @@ pub(crate) struct TwoLevel<'m> {
     workers: &'m Workers,
     padding: Padding,
     hats: Hats,
-    short: Short,
+    short: ShortWaves,
     coarse: Option<Coarse>,
     /// One value a hat: Φᵀ r, then the heights y.
     heights: Vec<f64>,
@@ -68,7 +68,7 @@ impl<'m> TwoLevel<'m> {
             workers,
             padding,
             hats,
-            short: Short::of(exposures),
+            short: ShortWaves::of(exposures),
             coarse: None,
             heights,
             spread,
@@ -91,11 +91,11 @@ impl<'m> TwoLevel<'m> {
         if self.coarse.is_none() {
             let Self { hats, short, workers, .. } = self;
             let (coarse, waves) = coarse_spaces(hats, short, reduced, workers, control)?;
-            self.coarse = Some(coarse);
-            self.waves = Some(waves).filter(|waves| !waves.is_empty());
-            if let Short::Aggregates = short {
+            if let ShortWaves::Aggregates = short {
                 self.aggregated = Some(Aggregated::new(reduced, workers, control)?);
             }
+            self.waves = Some(waves).filter(|waves| !waves.is_empty());
+            self.coarse = Some(coarse);
         }
         Ok(())
     }

@@ -59,7 +59,7 @@ pub(super) struct Direction<'l> {
     pub(super) height: f32,
     pub(super) above: &'l [f32],
     pub(super) below: &'l [f32],
-    /// What the hats times waves have of y.
+    /// What hats times waves, or aggregates, have of y.
     pub(super) modulated: &'l [f32],
 }
 
