@@ -30,5 +30,5 @@ pub(crate) use modulated::Modulated;
 pub(crate) use modulated_matrix::{SeenWave, Spot};
 pub(crate) use spacing::{DAMPING, bytes_needed, spacing, spacing_of_waves};
 pub(crate) use spectrum::{
-    BarelyConstrained, Complex, DEEPEST, MOST_WAVES, Symbol, barely_constrained, times,
+    BarelyConstrained, Complex, MOST_WAVES, Symbol, barely_constrained, times,
 };

@@ -16,7 +16,7 @@ use std::f64::consts::{PI, TAU};
 pub(crate) type Complex = [f64; 2];
 
 /// Waves of a larger λ do not delay conjugate gradients: the second level has eigenvalues of 1/4.
-pub(crate) const DEEPEST: f64 = 0.2;
+const DEEPEST: f64 = 0.2;
 /// Below, a wave is as good as undetermined, and single precision leaves errors in it.
 const DETERMINED: f64 = 1e-5;
 /// Minima of the scan that are followed further down.
@@ -55,8 +55,10 @@ pub(crate) struct Wave {
 pub(crate) struct BarelyConstrained {
     /// The deepest minima of λ, apart from q = 0.
     pub(crate) waves: Vec<Wave>,
-    /// The share of all wave vectors at which λ is below [`DEEPEST`].
+    /// The share of all wave vectors at which λ is below `below`.
     pub(crate) share: f64,
+    /// A quarter of λ's mean over waves whose phases at the exposures have nothing in common.
+    pub(crate) below: f64,
 }
 
 /// Those of exposures of these shares that reach so many pixels, and hats so far apart: the hats around one
@@ -88,8 +90,9 @@ pub(crate) fn barely_constrained(
             waves.push(Wave { vector, is_alone });
         }
     }
-    let below = scan.depths.iter().filter(|&&depth| depth < DEEPEST).count();
-    BarelyConstrained { waves, share: below as f64 / scan.depths.len() as f64 }
+    let below = (1.0 - shares.iter().map(|share| share * share).sum::<f64>()) / 4.0;
+    let count = scan.depths.iter().filter(|&&depth| depth < below).count();
+    BarelyConstrained { waves, share: count as f64 / scan.depths.len() as f64, below }
 }
 
 /// A wave vector between −π and π.

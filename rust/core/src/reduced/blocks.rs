@@ -4,8 +4,8 @@ use std::f64::consts::PI;
 
 use super::operator::Reduced;
 use crate::coarse::{
-    self, BarelyConstrained, Coarse, Complex, DEEPEST, Entry, Hats, Modulated, SeenWave, Spot,
-    Symbol, barely_constrained, spacing_of_waves, times,
+    self, BarelyConstrained, Coarse, Complex, Entry, Hats, Modulated, SeenWave, Spot, Symbol,
+    barely_constrained, spacing_of_waves, times,
 };
 use crate::control::Control;
 use crate::error::Result;
@@ -18,9 +18,6 @@ use crate::parallel::Workers;
 const BLOCKS: usize = 3;
 /// Of more waves that are barely constrained the deepest four are too few, and aggregates see them all.
 const MANY: f64 = 150.0;
-/// The share of wave vectors at which λ is small where waves have no minima of their own, as with one exposure
-/// of nearly all the weight.
-const MOST: f64 = 0.5;
 
 /// What sees the waves that exposures barely constrain.
 pub(super) enum ShortWaves {
@@ -44,11 +41,10 @@ impl ShortWaves {
         });
         let spacing = hats_of_waves(geometry);
         let spacing = [spacing.rows.spacing, spacing.cols.spacing];
-        let BarelyConstrained { waves, share } =
+        let BarelyConstrained { waves, share, below } =
             barely_constrained(&places, &shares, reach, spacing);
         // λ is below t in an ellipse around each minimum, of the share t/(4π √det Σ) where it is deep.
-        let count = 4.0 * PI * places.spread(&shares) * share / DEEPEST;
-        if count > MANY && share < MOST {
+        if 4.0 * PI * places.spread(&shares) * share / below > MANY {
             return Self::Aggregates;
         }
         let seen = waves.into_iter().map(|wave| {
