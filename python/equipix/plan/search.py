@@ -141,9 +141,9 @@ def suggest(
     one by one to where the predicted error is least.
 
     The farther five or six positions are apart, the more waves are barely constrained, and the more
-    products the solver takes between pixels (`budget.spectrum.passes`). Above 100 of them the error counts more,
-    by the square of their number: five positions then use a part of a large travel only. A sixth
-    or seventh position allows for a larger part of it.
+    products the solver takes between pixels (`budget.spectrum.passes`). Above 100 of them the error
+    counts more, by the square of their number: five positions then use a part of a large travel
+    only. A sixth or seventh position allows for a larger part of it.
 
     Examples
     --------
