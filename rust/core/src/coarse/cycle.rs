@@ -83,7 +83,8 @@ fn smooth(residual: &[f64], graph: &Graph, heights: &mut [f64]) {
 
 /// The coarsest aggregates, with a factor of their matrix.
 struct Coarsest {
-    /// Aggregates that hang together: constants in a part are no error, and what there is of them is rounding.
+    /// Aggregates that hang together: constants in a part are no error, or the hats see them where a prior holds
+    /// M, and else they are rounding.
     parts: Vec<Vec<usize>>,
     factor: Option<Cholesky>,
 }

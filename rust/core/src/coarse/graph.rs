@@ -170,7 +170,8 @@ impl Partition {
                 for member in self.members(aggregate) {
                     edges.of(member, |other, weight| {
                         let other = self.of[other];
-                        if other as usize == aggregate {
+                        // Rounding may leave an edge at one of its ends alone.
+                        if other == NONE || other as usize == aggregate {
                             return;
                         }
                         let slot = &mut slots[other as usize];

@@ -1,5 +1,7 @@
 //! The aggregates of pixels of S, with their matrix.
 
+use std::collections::BTreeMap;
+
 use super::operator::{Input, Reduced};
 use crate::coarse::{Cycle, Edges, Graph, NONE, Partition, STRONG};
 use crate::control::Control;
@@ -78,21 +80,28 @@ fn graph<T: Real>(
     Ok((pixels, graph))
 }
 
-/// How far apart pixels are, in a padded image, that see a cell in two exposures whose weights make the
-/// comparison count: in what they barely constrain such pixels are nearly alike.
+/// How far apart pixels are, in a padded image, that see a cell in two exposures of much weight: in what
+/// exposures barely constrain such pixels are nearly alike. There are as many pairs at least as connect all
+/// positions.
 fn apart(places: &[usize], shares: &[f64]) -> Vec<usize> {
-    let seen = || places.iter().zip(shares).enumerate();
-    let pairs = || seen().flat_map(|one| seen().map(move |other| (one, other)));
-    let pairs = || pairs().filter(|((one, _), (other, _))| one != other);
-    let weight = |one: &f64, other: &f64| one * other;
-    let heaviest = pairs().map(|((_, one), (_, other))| weight(one.1, other.1)).fold(0.0, f64::max);
-    let strong =
-        pairs().filter(|((_, one), (_, other))| weight(one.1, other.1) >= STRONG * heaviest);
-    let mut apart: Vec<usize> =
-        strong.map(|((_, one), (_, other))| one.0.wrapping_sub(*other.0)).collect();
+    let mut by_place = BTreeMap::new();
+    for (&place, share) in places.iter().zip(shares) {
+        *by_place.entry(place).or_insert(0.0) += share;
+    }
+    let seen: Vec<(usize, f64)> = by_place.into_iter().collect();
+    let others = |one: usize| seen.iter().skip(one + 1);
+    let mut pairs: Vec<(f64, usize)> = seen
+        .iter()
+        .enumerate()
+        .flat_map(|(index, one)| others(index).map(|other| (one.1 * other.1, other.0 - one.0)))
+        .collect();
+    pairs.sort_by(|a, b| b.0.total_cmp(&a.0));
+    let enough = pairs.get(seen.len().saturating_sub(2)).map_or(0.0, |pair| pair.0);
+    let least = pairs.first().map_or(0.0, |pair| STRONG * pair.0).min(enough);
+    let strong = pairs.iter().filter(|pair| pair.0 >= least).map(|pair| pair.1);
+    let mut apart: Vec<usize> = strong.flat_map(|apart| [apart, apart.wrapping_neg()]).collect();
     apart.sort_unstable();
     apart.dedup();
-    apart.retain(|&apart| apart != 0);
     apart
 }
 
@@ -108,10 +117,10 @@ struct Pixels<'r, 'm, 'a, T> {
 
 impl<T: Real> Pixels<'_, '_, '_, T> {
     /// w c² M².
-    fn weight(&self, exposure: usize, pixel: usize) -> f32 {
+    fn weight(&self, exposure: usize, pixel: usize) -> f64 {
         let weight = self.uniform[exposure];
         let weight = weight.unwrap_or_else(|| self.reduced.weight_of(exposure, pixel));
-        weight * self.reduced.sensitivity[pixel].powi(2)
+        f64::from(weight) * f64::from(self.reduced.sensitivity[pixel]).powi(2)
     }
 }
 
@@ -119,18 +128,20 @@ impl<T: Real> Edges for Pixels<'_, '_, '_, T> {
     fn of(&self, pixel: usize, mut add: impl FnMut(usize, f64)) {
         for (exposure, place) in self.places.iter().enumerate() {
             let cell = pixel + place;
-            let seen = self.reduced.share_of_cell(cell) * self.weight(exposure, pixel);
+            let share = f64::from(self.reduced.share_of_cell(cell));
             // Of a cell that only the weakest measurements see, 1/Σ w c² M² may be infinite.
-            if !(seen > 0.0 && seen.is_finite()) {
+            if !(share > 0.0 && share.is_finite()) {
                 continue;
             }
+            let weight = self.weight(exposure, pixel);
             for (beside, place) in self.places.iter().enumerate() {
                 // Before the first pixel there is none.
                 let other = cell.wrapping_sub(*place);
                 if self.pixels.of.get(other).is_some_and(|&of| of != NONE) {
-                    let weight = seen * self.weight(beside, other);
+                    // The same number from either end.
+                    let weight = share * (weight * self.weight(beside, other));
                     if weight > 0.0 {
-                        add(other, f64::from(weight));
+                        add(other, weight);
                     }
                 }
             }
@@ -146,15 +157,36 @@ impl<T: Real> Edges for Pixels<'_, '_, '_, T> {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use super::*;
     use crate::exposures::{Exposures, Flux, FluxKind, Mask, Measurements, Positions, Variance};
     use crate::frames::{Shape, Stack};
     use crate::reduced::ConjugateGradients;
     use crate::testing::random_number;
+    use crate::weak_light::Prior;
 
     const SENSOR: Shape = Shape::new(23, 31);
     /// Far apart, so that pixels see cells alone, and one cell of two exposures each in places.
     const SHIFTS: [[f64; 2]; 4] = [[0.0, 0.0], [7.0, -12.0], [-9.0, 5.0], [3.0, 16.0]];
+
+    #[test]
+    fn neighbours_are_those_of_much_weight_and_connect_all_positions() {
+        let of = |places: &[usize], shares: &[f64]| {
+            let apart = apart(places, shares);
+            let back: Vec<usize> = apart.iter().map(|apart| apart.wrapping_neg()).collect();
+            assert!(back.iter().all(|back| apart.contains(back)));
+            apart.into_iter().filter(|apart| *apart < usize::MAX / 2).collect::<Vec<_>>()
+        };
+        assert_eq!(of(&[0, 100, 10, 1000], &[0.25; 4]), [10, 90, 100, 900, 990, 1000]);
+        // One of little weight; one of much; two of much at one place, which compare nothing there.
+        assert_eq!(of(&[0, 10, 100, 1000], &[1.0, 1.0, 1.0, 0.01]), [10, 90, 100]);
+        assert_eq!(of(&[0, 10, 100, 1000], &[1.0, 0.01, 0.01, 0.01]), [10, 100, 1000]);
+        assert_eq!(of(&[10, 10, 0, 100], &[1.0, 1.0, 0.1, 0.1]), [10, 90]);
+        // Two of much weight are not enough.
+        assert_eq!(of(&[0, 1, 10, 100], &[1.0, 1.0, 0.1, 0.1]), [1, 9, 10, 99, 100]);
+        assert!(of(&[5, 5], &[0.5; 2]).is_empty());
+    }
 
     #[test]
     fn the_matrix_is_that_of_the_columns() {
@@ -186,7 +218,7 @@ mod tests {
             let beams = [(0..cells).map(|at| positive(at + 4321)).collect()];
             solver.linearise(&sensitivity, &beams, None, &control).unwrap();
             let reduced = &mut solver.reduced;
-            let (pixels, graph) = graph(reduced, &workers, &control).unwrap();
+            let (pixels, matrix) = graph(reduced, &workers, &control).unwrap();
             assert!(pixels.count() > 20 && pixels.count() < SENSOR.len() / 2);
             let heights: Vec<f64> = (0..pixels.count()).map(|at| random_number(at + 11)).collect();
             let x: Vec<f32> = pixels
@@ -197,10 +229,26 @@ mod tests {
                 .collect();
             let mut product = vec![0.0; x.len()];
             let wanted = reduced.multiply(&x, &mut product, &control).unwrap();
-            let left = graph.residual(&vec![0.0; heights.len()], &heights, &workers);
+            let left = matrix.residual(&vec![0.0; heights.len()], &heights, &workers);
             let found: f64 = left.iter().zip(&heights).map(|(left, y)| -left * y).sum();
             // Single precision, and the product is a difference of sums some times as large.
             assert!((found / wanted - 1.0).abs() < 1e-5, "{found} {wanted}");
+            // A prior alone resists what is the same everywhere.
+            let held = Arc::from(vec![1e6; SENSOR.len()]);
+            let mut prior = Prior::new(held, vec![0; SENSOR.len()].into());
+            prior.at(&sensitivity);
+            solver.linearise(&sensitivity, &beams, Some(&prior), &control).unwrap();
+            let reduced = &mut solver.reduced;
+            let (pixels, matrix) = graph(reduced, &workers, &control).unwrap();
+            let ones = vec![1.0; pixels.count()];
+            let left = matrix.residual(&vec![0.0; ones.len()], &ones, &workers);
+            let weights = &reduced.weak.as_ref().unwrap().weights;
+            let of = |pixel: usize| f64::from(weights[pixel]);
+            let of = |pixel| of(pixel) * f64::from(reduced.sensitivity[pixel]).powi(2);
+            let scale = left.iter().fold(0.0, |most: f64, left| most.max(-left));
+            for (found, wanted) in left.iter().zip(pixels.sums(of, &workers)) {
+                assert!((found + wanted).abs() < 1e-5 * scale, "{found} {wanted}");
+            }
         }
     }
 }

@@ -64,7 +64,7 @@ impl ShortWaves {
 }
 
 /// What the coarse spaces of these exposures take, in bytes: those of aggregates for each place of the padded
-/// sensor, where 18 were measured for five positions. Their matrix grows with the number.
+/// sensor, where 18 were measured for five positions of equal weight.
 pub(super) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>, places: u64) -> u64 {
     let short = ShortWaves::of(exposures);
     let each = 12 + 4 * exposures.count() as u64;
