@@ -164,7 +164,7 @@ mod tests {
     fn a_cycle_is_symmetric_and_nearly_the_inverse() {
         let (workers, control) = (Workers::new(None).unwrap(), Control::new());
         for own in [0.0, 0.4] {
-            let alone = |at: usize| (0..1).map(move |_| (at, 1.0)).filter(|_| false);
+            let alone = |_| std::iter::empty();
             let each = Partition::neighbourhoods(COUNT, |_| true, alone, &control).unwrap();
             let graph = each.graph(&Lattice(own), &workers, &control).unwrap();
             let cycle = Cycle::new(graph, &workers, &control).unwrap();

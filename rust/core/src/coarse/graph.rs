@@ -129,7 +129,7 @@ impl Partition {
     }
 
     /// The unknowns of an aggregate.
-    pub(crate) fn members(&self, aggregate: usize) -> impl Iterator<Item = usize> {
+    fn members(&self, aggregate: usize) -> impl Iterator<Item = usize> {
         let members = &self.members[self.starts[aggregate]..self.starts[aggregate + 1]];
         members.iter().map(|&member| member as usize)
     }
