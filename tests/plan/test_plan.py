@@ -398,8 +398,11 @@ class TestPasses:
     def test_are_those_of_a_calibration_within_a_factor_of_two(self, shifts):
         shape = (300, 400)
         found = pattern_errors.spectrum(shifts, np.ones(len(shifts))).passes
-        # Where waves would take more, the solver has aggregates.
-        assert 0.5 < min(found, 60) / products(shape, shifts) < 2
+        taken = products(shape, shifts)
+        if found <= 60:
+            assert 0.5 < found / taken < 2
+        else:  # The solver may have aggregates.
+            assert 30 < taken <= 100
 
     def test_no_wave_counts_twice(self):
         """A pattern and itself with exchanged or reversed axes, and moved, take as many."""

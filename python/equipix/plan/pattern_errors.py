@@ -310,8 +310,8 @@ class Spectrum:
         λ there.
     passes : float
         Products with the data that `calibrate` is expected to take for such shifts, whatever the
-        size of the sensor: within a factor of two up to 60 of them. At whole shifts it takes
-        hardly more than 100. Between pixels `passes` only compares patterns.
+        size of the sensor: within a factor of two up to 60 of them. At whole shifts of one
+        orientation it takes hardly more than 100. Between pixels `passes` only compares patterns.
     """
 
     rows: Floats

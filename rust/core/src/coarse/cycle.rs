@@ -40,7 +40,8 @@ impl Cycle {
             // What is compared with nothing is no error that S can see. Of all others each aggregate has two.
             let is_compared = |row| graph.row(row).next().is_some();
             let neighbours = |row| graph.strong(row);
-            let coarser = Partition::neighbourhoods(count, is_compared, neighbours, control)?;
+            let coarser =
+                Partition::neighbourhoods(count, is_compared, neighbours, workers, control)?;
             let next = coarser.graph(&graph, workers, control)?;
             levels.push((graph, coarser));
             graph = next;
@@ -133,18 +134,20 @@ mod tests {
     use crate::testing::random_number;
 
     const SIDE: usize = 60;
-    const COUNT: usize = SIDE * SIDE;
+    /// More than are factorised are compared with nothing: they must not keep levels from growing coarser.
+    const ALONE: usize = FEW + SIDE;
+    const COUNT: usize = SIDE * SIDE + ALONE;
 
-    /// A square lattice of equal edges, its last row beside it by itself, with a prior on some or on none.
+    /// A square lattice of equal edges, and unknowns by themselves, with a prior on some or on none.
     struct Lattice(f64);
 
     impl Edges for Lattice {
         fn of(&self, unknown: usize, mut add: impl FnMut(usize, f64)) {
             let (row, col) = (unknown / SIDE, unknown % SIDE);
-            if row + 1 == SIDE {
+            if row >= SIDE {
                 return;
             }
-            let below = (row + 2 < SIDE).then_some(unknown + SIDE);
+            let below = (row + 1 < SIDE).then_some(unknown + SIDE);
             let beside = [(col > 0).then(|| unknown - 1), (col + 1 < SIDE).then_some(unknown + 1)];
             let above = (row > 0).then(|| unknown - SIDE);
             [below, above].into_iter().chain(beside).flatten().for_each(|other| add(other, 1.0));
@@ -165,7 +168,8 @@ mod tests {
         let (workers, control) = (Workers::new(None).unwrap(), Control::new());
         for own in [0.0, 0.4] {
             let alone = |_| std::iter::empty();
-            let each = Partition::neighbourhoods(COUNT, |_| true, alone, &control).unwrap();
+            let each =
+                Partition::neighbourhoods(COUNT, |_| true, alone, &workers, &control).unwrap();
             let graph = each.graph(&Lattice(own), &workers, &control).unwrap();
             let cycle = Cycle::new(graph, &workers, &control).unwrap();
             assert!(cycle.levels.len() == 2, "{}", cycle.levels.len());

@@ -61,9 +61,10 @@ impl Partition {
         size: usize,
         is_used: impl Fn(usize) -> bool,
         neighbours: impl Fn(usize) -> N,
+        workers: &Workers,
         control: &Control,
     ) -> Result<Self> {
-        let mut of = vec![NONE; size];
+        let mut of = workers.filled(size, NONE, control);
         in_parts(size, control, |unknown| {
             if is_used(unknown) {
                 of[unknown] = FREE;
@@ -170,7 +171,7 @@ impl Partition {
                 for member in self.members(aggregate) {
                     edges.of(member, |other, weight| {
                         let other = self.of[other];
-                        // Rounding may leave an edge at one of its ends alone.
+                        // What is compared with nothing is in none.
                         if other == NONE || other as usize == aggregate {
                             return;
                         }
@@ -347,20 +348,27 @@ mod tests {
 
     #[test]
     fn an_aggregate_is_an_unknown_with_all_its_neighbours() {
-        // A chain of nine, of which number 4 is not used: 0 1 | 2 3 joins; 5 6 | 7 8 joins.
+        let (workers, control) = (Workers::new(None).unwrap(), Control::new());
+        // A chain of nine, of which number 4 is not used: 1 is beside 0, 3 beside 2.
         let beside = |at: usize| [at.wrapping_sub(1), at + 1].map(|other| (other, 1.0)).into_iter();
-        let chain = Partition::neighbourhoods(9, |at| at != 4, beside, &Control::new()).unwrap();
+        let chain = Partition::neighbourhoods(9, |at| at != 4, beside, &workers, &control).unwrap();
         assert_eq!(chain.of, [0, 0, 1, 1, NONE, 2, 2, 3, 3]);
         let members: Vec<Vec<usize>> = (0..4).map(|index| chain.members(index).collect()).collect();
         assert_eq!(members, [[0, 1], [2, 3], [5, 6], [7, 8]]);
-        let sums = chain.sums(|at| (at * at) as f64, &Workers::new(None).unwrap());
+        let sums = chain.sums(|at| (at * at) as f64, &workers);
         assert_eq!(sums, [1.0, 13.0, 61.0, 113.0]);
-        // 0 and 1 are one, 3 joins 2, and 4 is compared with nothing.
-        let edges = [vec![(1, 1.0)], vec![(0, 1.0), (2, 2.0)], vec![(1, 2.0), (3, 3.0)]];
-        let edges = [&edges[..], &[vec![(2, 3.0)], vec![]]].concat();
-        let beside = |at: usize| edges[at].clone().into_iter();
-        let lone = Partition::neighbourhoods(5, |_| true, beside, &Control::new()).unwrap();
-        assert_eq!(lone.of, [0, 0, 1, 1, 2]);
+        // 0 takes 1, and 2 takes 3. 4 is beside 1 and 3, and joins the heavier; 5 is by itself.
+        for (to_1, to_3, joined) in [(1.0, 2.0, 1), (2.0, 1.0, 0)] {
+            for of_4 in [[(1, to_1), (3, to_3)], [(3, to_3), (1, to_1)]] {
+                let pairs = |one, other, to_4| [vec![(other, 5.0)], vec![(one, 5.0), (4, to_4)]];
+                let edges =
+                    [pairs(0, 1, to_1), pairs(2, 3, to_3), [of_4.to_vec(), vec![]]].concat();
+                let beside = |at: usize| edges[at].clone().into_iter();
+                let joins =
+                    Partition::neighbourhoods(6, |_| true, beside, &workers, &control).unwrap();
+                assert_eq!(joins.of, [0, 0, 1, 1, joined, 2]);
+            }
+        }
     }
 
     #[test]
@@ -370,9 +378,14 @@ mod tests {
             let edges = Lattice { side: 60, held };
             let fine = whole(&edges, &workers);
             let strong = |row| fine.strong(row);
-            let partition =
-                Partition::neighbourhoods(edges.count(), |_| true, strong, &Control::new())
-                    .unwrap();
+            let partition = Partition::neighbourhoods(
+                edges.count(),
+                |_| true,
+                strong,
+                &workers,
+                &Control::new(),
+            )
+            .unwrap();
             assert!(partition.count() < edges.count() / 2);
             let coarse = partition.graph(&fine, &workers, &Control::new()).unwrap();
             let heights = vector(partition.count(), 5);

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use super::blocks::distinct;
 use super::operator::{Input, Reduced};
 use crate::coarse::{Cycle, Edges, Graph, NONE, Partition, STRONG};
 use crate::control::Control;
@@ -66,77 +67,103 @@ fn graph<T: Real>(
     reduced.eliminate(Input::Weight, control);
     control.check()?;
     let reduced = &*reduced;
-    let places = &reduced.exposures.geometry().placements;
-    let places: Vec<usize> =
-        places.iter().map(|place| place.row * reduced.padding.width + place.col).collect();
+    let sources = Source::all(reduced);
     let inverse = &reduced.inverse_diagonal;
-    let apart = apart(&places, &reduced.exposures.shares());
-    let beside = |pixel: usize| apart.iter().map(move |apart| (pixel.wrapping_add(*apart), 1.0));
-    let is_used = |pixel: usize| inverse[pixel] > 0.0;
-    let pixels = Partition::neighbourhoods(inverse.len(), is_used, beside, control)?;
-    let uniform = (0..places.len()).map(|exposure| reduced.uniform_weight(exposure)).collect();
-    let edges = Pixels { reduced, places, pixels: &pixels, uniform };
+    let [strong, weak] = apart(&sources);
+    let beside = |pixel: usize| {
+        strong.iter().map(move |&(apart, weight)| (pixel.wrapping_add(apart), weight as f32))
+    };
+    let is_seen = |pixel: usize| inverse.get(pixel).is_some_and(|&inverse| inverse > 0.0);
+    // The diagonal does those that are compared with nothing.
+    let is_used = |pixel: usize| {
+        let mut all = strong.iter().chain(&weak).map(|&(apart, _)| pixel.wrapping_add(apart));
+        is_seen(pixel) && all.any(is_seen)
+    };
+    let pixels = Partition::neighbourhoods(inverse.len(), is_used, beside, workers, control)?;
+    let edges = Pixels { reduced, sources, pixels: &pixels };
     let graph = pixels.graph(&edges, workers, control)?;
     Ok((pixels, graph))
 }
 
-/// How far apart pixels are, in a padded image, that see a cell in two exposures of much weight: in what
-/// exposures barely constrain such pixels are nearly alike. There are as many pairs at least as connect all
-/// positions.
-fn apart(places: &[usize], shares: &[f64]) -> Vec<usize> {
-    let mut by_place = BTreeMap::new();
-    for (&place, share) in places.iter().zip(shares) {
-        *by_place.entry(place).or_insert(0.0) += share;
+/// The exposures at one place: for what they compare they are one.
+struct Source {
+    /// How far behind a pixel the cell stands that they see there, in a padded image.
+    behind: usize,
+    exposures: Vec<usize>,
+    /// Their share of all weight.
+    share: f64,
+    /// Σ w c² where it is the same for all pixels.
+    uniform: Option<f32>,
+}
+
+impl Source {
+    fn all<T: Real>(reduced: &Reduced<'_, '_, T>) -> Vec<Self> {
+        let placements = &reduced.exposures.geometry().placements;
+        let shares = reduced.exposures.shares();
+        let alike = distinct(placements).into_iter();
+        alike
+            .map(|exposures| Self {
+                behind: {
+                    let place = &placements[exposures[0]];
+                    place.row * reduced.padding.width + place.col
+                },
+                share: exposures.iter().map(|&exposure| shares[exposure]).sum(),
+                uniform: exposures.iter().map(|&one| reduced.uniform_weight(one)).sum(),
+                exposures,
+            })
+            .collect()
     }
-    let seen: Vec<(usize, f64)> = by_place.into_iter().collect();
-    let others = |one: usize| seen.iter().skip(one + 1);
-    let mut pairs: Vec<(f64, usize)> = seen
-        .iter()
-        .enumerate()
-        .flat_map(|(index, one)| others(index).map(|other| (one.1 * other.1, other.0 - one.0)))
-        .collect();
-    pairs.sort_by(|a, b| b.0.total_cmp(&a.0));
-    let enough = pairs.get(seen.len().saturating_sub(2)).map_or(0.0, |pair| pair.0);
-    let least = pairs.first().map_or(0.0, |pair| STRONG * pair.0).min(enough);
-    let strong = pairs.iter().filter(|pair| pair.0 >= least).map(|pair| pair.1);
-    let mut apart: Vec<usize> = strong.flat_map(|apart| [apart, apart.wrapping_neg()]).collect();
-    apart.sort_unstable();
-    apart.dedup();
-    apart
+}
+
+/// How far apart pixels are that see a cell in two exposures, in either direction, and the weight of that
+/// comparison: first the strong ones, of pixels that are nearly alike in what exposures barely constrain.
+///
+/// Weak ones make no aggregates, even if strong ones alone do not connect all pixels: what they barely
+/// constrain is the height of each part, so that no aggregate may reach over two.
+fn apart(sources: &[Source]) -> [Vec<(usize, f64)>; 2] {
+    let pairs = sources.iter().flat_map(|one| sources.iter().map(move |other| (one, other)));
+    let weights = pairs
+        .map(|(one, other)| (one.behind.wrapping_sub(other.behind), one.share * other.share))
+        .filter(|&(apart, _)| apart != 0);
+    let mut apart: BTreeMap<usize, f64> = BTreeMap::new();
+    for (distance, weight) in weights {
+        let largest = apart.entry(distance).or_insert(0.0);
+        *largest = largest.max(weight);
+    }
+    let least = apart.values().map(|weight| STRONG * weight).fold(0.0, f64::max);
+    let (strong, weak) = apart.into_iter().partition(|&(_, weight)| weight >= least);
+    [strong, weak]
 }
 
 /// The pixels that see a cell are compared with each other: Ω_k Ω_l / Σ Ω, with Ω = w c² L² M².
 struct Pixels<'r, 'm, 'a, T> {
     reduced: &'r Reduced<'m, 'a, T>,
-    /// How far behind a pixel the cell stands that an exposure sees there.
-    places: Vec<usize>,
+    sources: Vec<Source>,
     pixels: &'r Partition,
-    /// w c² of exposures where it is the same for all measurements.
-    uniform: Vec<Option<f32>>,
 }
 
 impl<T: Real> Pixels<'_, '_, '_, T> {
-    /// w c² M².
-    fn weight(&self, exposure: usize, pixel: usize) -> f64 {
-        let weight = self.uniform[exposure];
-        let weight = weight.unwrap_or_else(|| self.reduced.weight_of(exposure, pixel));
+    /// Σ w c² M² of the exposures of one place.
+    fn weight(&self, source: &Source, pixel: usize) -> f64 {
+        let each = || source.exposures.iter().map(|&one| self.reduced.weight_of(one, pixel)).sum();
+        let weight = source.uniform.unwrap_or_else(each);
         f64::from(weight) * f64::from(self.reduced.sensitivity[pixel]).powi(2)
     }
 }
 
 impl<T: Real> Edges for Pixels<'_, '_, '_, T> {
     fn of(&self, pixel: usize, mut add: impl FnMut(usize, f64)) {
-        for (exposure, place) in self.places.iter().enumerate() {
-            let cell = pixel + place;
+        for source in &self.sources {
+            let cell = pixel + source.behind;
             let share = f64::from(self.reduced.share_of_cell(cell));
             // Of a cell that only the weakest measurements see, 1/Σ w c² M² may be infinite.
             if !(share > 0.0 && share.is_finite()) {
                 continue;
             }
-            let weight = self.weight(exposure, pixel);
-            for (beside, place) in self.places.iter().enumerate() {
+            let weight = self.weight(source, pixel);
+            for beside in &self.sources {
                 // Before the first pixel there is none.
-                let other = cell.wrapping_sub(*place);
+                let other = cell.wrapping_sub(beside.behind);
                 if self.pixels.of.get(other).is_some_and(|&of| of != NONE) {
                     // The same number from either end.
                     let weight = share * (weight * self.weight(beside, other));
@@ -171,21 +198,32 @@ mod tests {
     const SHIFTS: [[f64; 2]; 4] = [[0.0, 0.0], [7.0, -12.0], [-9.0, 5.0], [3.0, 16.0]];
 
     #[test]
-    fn neighbours_are_those_of_much_weight_and_connect_all_positions() {
-        let of = |places: &[usize], shares: &[f64]| {
-            let apart = apart(places, shares);
-            let back: Vec<usize> = apart.iter().map(|apart| apart.wrapping_neg()).collect();
-            assert!(back.iter().all(|back| apart.contains(back)));
-            apart.into_iter().filter(|apart| *apart < usize::MAX / 2).collect::<Vec<_>>()
+    fn strong_neighbours_are_those_of_much_weight() {
+        let of = |places: &[(usize, f64)]| {
+            let source =
+                |&(behind, share)| Source { behind, exposures: vec![], share, uniform: None };
+            let [strong, weak] = apart(&places.iter().map(source).collect::<Vec<_>>());
+            let count = places.len() * (places.len() - 1);
+            assert_eq!(strong.len() + weak.len(), count);
+            // The weight is the same in both directions.
+            let back = |&(apart, weight): &(usize, f64)| (apart.wrapping_neg(), weight);
+            assert!(strong.iter().map(back).all(|back| strong.contains(&back)));
+            let ahead = strong.into_iter().filter(|(apart, _)| *apart < usize::MAX / 2);
+            ahead.collect::<Vec<_>>()
         };
-        assert_eq!(of(&[0, 100, 10, 1000], &[0.25; 4]), [10, 90, 100, 900, 990, 1000]);
-        // One of little weight; one of much; two of much at one place, which compare nothing there.
-        assert_eq!(of(&[0, 10, 100, 1000], &[1.0, 1.0, 1.0, 0.01]), [10, 90, 100]);
-        assert_eq!(of(&[0, 10, 100, 1000], &[1.0, 0.01, 0.01, 0.01]), [10, 100, 1000]);
-        assert_eq!(of(&[10, 10, 0, 100], &[1.0, 1.0, 0.1, 0.1]), [10, 90]);
-        // Two of much weight are not enough.
-        assert_eq!(of(&[0, 1, 10, 100], &[1.0, 1.0, 0.1, 0.1]), [1, 9, 10, 99, 100]);
-        assert!(of(&[5, 5], &[0.5; 2]).is_empty());
+        let found = of(&[(0, 0.5), (100, 0.4), (10, 0.25)]);
+        assert_eq!(found, [(10, 0.125), (90, 0.1), (100, 0.2)]);
+        // One of little weight; one of much, so that its pairs are the heaviest; two of much.
+        let found = of(&[(0, 1.0), (10, 1.0), (100, 1.0), (1000, 0.01)]);
+        assert_eq!(found, [(10, 1.0), (90, 1.0), (100, 1.0)]);
+        let found = of(&[(0, 1.0), (10, 0.01), (100, 0.01), (1000, 0.01)]);
+        assert_eq!(found, [(10, 0.01), (100, 0.01), (1000, 0.01)]);
+        assert_eq!(of(&[(0, 1.0), (1, 1.0), (10, 0.1), (100, 0.1)]), [(1, 1.0)]);
+        assert!(of(&[(5, 1.0)]).is_empty());
+        // Of two pairs that are as far apart the heavier counts.
+        let source = |behind, share| Source { behind, exposures: vec![], share, uniform: None };
+        let [strong, _] = apart(&[source(0, 0.25), source(7, 0.25), source(14, 0.5)]);
+        assert!(strong.contains(&(7, 0.125)), "{strong:?}");
     }
 
     #[test]

@@ -33,10 +33,14 @@ impl ShortWaves {
         if geometry.views.len() > 1 {
             return Self::Waves(Vec::new());
         }
-        let places = Places(&geometry.placements);
-        let shares = exposures.shares();
+        let all = Places(geometry.placements.iter().map(|place| [place.row, place.col]).collect());
+        let of_exposures = exposures.shares();
+        let alike = distinct(&geometry.placements);
+        let places = Places(alike.iter().map(|exposures| all.0[exposures[0]]).collect());
+        let shares: Vec<f64> =
+            alike.iter().map(|alike| alike.iter().map(|&one| of_exposures[one]).sum()).collect();
         let reach = [0, 1].map(|axis| {
-            let along = places.0.iter().map(|place| [place.row, place.col][axis]);
+            let along = places.0.iter().map(|place| place[axis]);
             along.clone().max().unwrap_or(0) - along.min().unwrap_or(0)
         });
         let spacing = hats_of_waves(geometry);
@@ -49,8 +53,8 @@ impl ShortWaves {
         }
         let seen = waves.into_iter().map(|wave| {
             let [q, p] = wave.vector;
-            let factor = |k: usize| times(places.along(0, k, q), places.along(1, k, p));
-            SeenWave { wave, factors: (0..places.0.len()).map(factor).collect(), penalty: 0.0 }
+            let factor = |k: usize| times(all.along(0, k, q), all.along(1, k, p));
+            SeenWave { wave, factors: (0..all.0.len()).map(factor).collect(), penalty: 0.0 }
         });
         Self::Waves(seen.collect())
     }
@@ -67,7 +71,7 @@ impl ShortWaves {
 /// sensor, where 18 were measured for five positions of equal weight.
 pub(super) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>, places: u64) -> u64 {
     let short = ShortWaves::of(exposures);
-    let each = 12 + 4 * exposures.count() as u64;
+    let each = 12 + 4 * distinct(&exposures.geometry().placements).len() as u64;
     let of_aggregates = if let ShortWaves::Aggregates = short { each * places } else { 0 };
     coarse::bytes_needed(exposures.geometry(), short.waves().len()) + of_aggregates
 }
@@ -111,12 +115,29 @@ pub(super) fn coarse_spaces<T: Real>(
     Ok((coarse, waves))
 }
 
-struct Places<'p>(&'p [Placement]);
+/// The exposures at each place, in their order.
+pub(super) fn distinct(placements: &[Placement]) -> Vec<Vec<usize>> {
+    let mut found: Vec<Vec<usize>> = Vec::new();
+    for (exposure, place) in placements.iter().enumerate() {
+        let is_here = |other: &usize| {
+            let other = &placements[*other];
+            (other.row, other.col) == (place.row, place.col)
+        };
+        match found.iter_mut().find(|alike| is_here(&alike[0])) {
+            Some(alike) => alike.push(exposure),
+            None => found.push(vec![exposure]),
+        }
+    }
+    found
+}
 
-impl Places<'_> {
+/// Rows and columns of places.
+struct Places(Vec<[usize; 2]>);
+
+impl Places {
     /// √det Σ, with Σ the covariance of the shifts.
     fn spread(&self, shares: &[f64]) -> f64 {
-        let at = |place: &Placement| [place.row as f64, place.col as f64];
+        let at = |place: &[usize; 2]| place.map(|along| along as f64);
         let mean = |value: &dyn Fn([f64; 2]) -> f64| -> f64 {
             self.0.iter().zip(shares).map(|(place, share)| share * value(at(place))).sum()
         };
@@ -127,10 +148,9 @@ impl Places<'_> {
     }
 }
 
-impl Symbol for Places<'_> {
-    fn along(&self, axis: usize, exposure: usize, q: f64) -> Complex {
-        let place = &self.0[exposure];
-        let (sin, cos) = (q * [place.row, place.col][axis] as f64).sin_cos();
+impl Symbol for Places {
+    fn along(&self, axis: usize, place: usize, q: f64) -> Complex {
+        let (sin, cos) = (q * self.0[place][axis] as f64).sin_cos();
         [cos, -sin]
     }
 
@@ -228,5 +248,55 @@ impl Blocks {
                 Spot { exposure, weight: f64::from(weight), hats }
             })
             .collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::exposures::{Flux, FluxKind, Mask, Measurements, Positions, Variance};
+    use crate::frames::Stack;
+
+    const CROSS: [[f64; 2]; 5] = [[0.0, 0.0], [0.0, 11.0], [0.0, 19.0], [11.0, 0.0], [19.0, 0.0]];
+    const FAR: [[f64; 2]; 5] =
+        [[34.0, -24.0], [-39.0, -20.0], [-9.0, 32.0], [-5.0, -41.0], [-17.0, 10.0]];
+
+    /// Whether aggregates see the short waves, and what the spaces are said to take.
+    fn of(shifts: &[[f64; 2]], variances: &[f64]) -> (bool, u64) {
+        let (workers, control) = (Workers::new(None).unwrap(), Control::new());
+        let sensor = Shape::new(120, 160);
+        let frames = vec![1.0; shifts.len() * sensor.len()];
+        let frames = Stack::new("frames", &frames[..], shifts.len(), sensor).unwrap();
+        let measurements =
+            Measurements { frames, variance: Variance::Exposures(variances), mask: Mask::None };
+        let flux = Flux { values: vec![1.0; shifts.len()], kind: FluxKind::Known };
+        let positions = Positions::of_shifts(shifts);
+        let exposures =
+            Exposures::new(measurements, positions, flux, false, &workers, &control).unwrap();
+        let is_many = matches!(ShortWaves::of(&exposures), ShortWaves::Aggregates);
+        (is_many, bytes_needed(&exposures, 30_000))
+    }
+
+    #[test]
+    fn aggregates_are_for_positions_far_apart() {
+        let equal = [1e-6; 5];
+        let heavy = |variance| [1e-6, 1e-6, variance, 1e-6, 1e-6];
+        for variances in [equal, heavy(1e-4), heavy(1e-8)] {
+            assert!(!of(&CROSS, &variances).0, "{variances:?}");
+            assert!(of(&FAR, &variances).0, "{variances:?}");
+        }
+        // Along a line no minima can be told apart.
+        let line = FAR.map(|[row, _]| [row, 2.0 * row]);
+        assert!(!of(&line, &equal).0);
+    }
+
+    #[test]
+    fn exposures_at_one_place_count_as_one_of_their_weight() {
+        for shifts in [CROSS, FAR] {
+            let weighed = of(&shifts, &[1e-6, 1e-6, 1e-6, 1e-6, 0.25e-6]);
+            let last = shifts[4];
+            let repeated = [&shifts[..], &[last; 3]].concat();
+            assert_eq!(of(&repeated, &[1e-6; 8]), weighed);
+        }
     }
 }

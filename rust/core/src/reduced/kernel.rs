@@ -67,7 +67,8 @@ impl pulp::NullaryFnOnce for Divide<'_> {
     #[inline(always)]
     fn call(self) {
         for (signal, &weight) in self.signal.iter_mut().zip(self.weight) {
-            *signal = if weight > 0.0 { *signal / weight } else { 0.0 };
+            // Below, 1/weight may be infinite.
+            *signal = if weight >= f32::MIN_POSITIVE { *signal / weight } else { 0.0 };
         }
     }
 }
