@@ -4,8 +4,8 @@ use std::f64::consts::PI;
 
 use super::operator::Reduced;
 use crate::coarse::{
-    self, BarelyConstrained, Coarse, Complex, Entry, Hats, Modulated, SeenWave, Spot, Symbol,
-    barely_constrained, spacing_of_waves, times,
+    self, BarelyConstrained, Coarse, Complex, Entry, Hats, Modulated, STRONG, SeenWave, Spot,
+    Symbol, barely_constrained, spacing_of_waves, times,
 };
 use crate::control::Control;
 use crate::error::Result;
@@ -34,11 +34,10 @@ impl ShortWaves {
             return Self::Waves(Vec::new());
         }
         let all = Places(geometry.placements.iter().map(|place| [place.row, place.col]).collect());
-        let of_exposures = exposures.shares();
-        let alike = distinct(&geometry.placements);
-        let places = Places(alike.iter().map(|exposures| all.0[exposures[0]]).collect());
-        let shares: Vec<f64> =
-            alike.iter().map(|alike| alike.iter().map(|&one| of_exposures[one]).sum()).collect();
+        let places = Places(
+            distinct(&geometry.placements).iter().map(|exposures| all.0[exposures[0]]).collect(),
+        );
+        let shares = shares_of_places(exposures);
         let reach = [0, 1].map(|axis| {
             let along = places.0.iter().map(|place| place[axis]);
             along.clone().max().unwrap_or(0) - along.min().unwrap_or(0)
@@ -68,12 +67,28 @@ impl ShortWaves {
 }
 
 /// What the coarse spaces of these exposures take, in bytes: those of aggregates for each place of the padded
-/// sensor, where 18 were measured for five positions of equal weight.
+/// sensor. As measured for five to seven positions, and for five of which one to three are of much weight: the
+/// fewer pairs make aggregates, the smaller these are, and the more edges there are between them.
 pub(super) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>, places: u64) -> u64 {
     let short = ShortWaves::of(exposures);
-    let each = 12 + 4 * distinct(&exposures.geometry().placements).len() as u64;
-    let of_aggregates = if let ShortWaves::Aggregates = short { each * places } else { 0 };
+    let of_aggregates = if let ShortWaves::Aggregates = short {
+        let shares = shares_of_places(exposures);
+        let others = |one: usize| shares.iter().skip(one + 1).map(move |other| (one, other));
+        let pairs = || (0..shares.len()).flat_map(others).map(|(one, other)| shares[one] * other);
+        let least = STRONG * pairs().fold(0.0, f64::max);
+        let strong = pairs().filter(|&pair| pair >= least).count().max(1);
+        (12 + 4 * shares.len() * pairs().count() / strong) as u64 * places
+    } else {
+        0
+    };
     coarse::bytes_needed(exposures.geometry(), short.waves().len()) + of_aggregates
+}
+
+/// The share of the exposures at each place in all weight.
+fn shares_of_places<T: Real>(exposures: &Exposures<'_, T>) -> Vec<f64> {
+    let shares = exposures.shares();
+    let places = distinct(&exposures.geometry().placements);
+    places.iter().map(|alike| alike.iter().map(|&one| shares[one]).sum()).collect()
 }
 
 fn hats_of_waves(geometry: &Geometry) -> Hats {
@@ -293,10 +308,9 @@ mod tests {
     #[test]
     fn exposures_at_one_place_count_as_one_of_their_weight() {
         for shifts in [CROSS, FAR] {
-            let weighed = of(&shifts, &[1e-6, 1e-6, 1e-6, 1e-6, 0.25e-6]);
-            let last = shifts[4];
-            let repeated = [&shifts[..], &[last; 3]].concat();
-            assert_eq!(of(&repeated, &[1e-6; 8]), weighed);
+            let weighed = of(&shifts, &[1e-6, 1e-6, 1e-6, 1e-6, 0.5e-6]);
+            let repeated = [&shifts[..], &shifts[4..]].concat();
+            assert_eq!(of(&repeated, &[1e-6; 6]), weighed);
         }
     }
 }

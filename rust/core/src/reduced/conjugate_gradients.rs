@@ -33,7 +33,7 @@ const UNRESOLVED: f64 = 4e-12;
 /// |---|---|
 /// | x, residual, direction, product; M and 1/D in single precision | 6 · 4 for each place of the sensor |
 /// | L², h | 2 · 4 for each place of each view |
-/// | aggregates and their matrices, where they take the place of waves | 12, and 4 for each exposure, for each place of the sensor |
+/// | aggregates and their matrices, where they take the place of waves | for each place of the sensor 12, and 4 for each place of exposures times all pairs over those of much weight |
 /// | the coarse matrices and their factors | some 2700 for each hat, 8000 for one of a wave, or of a full matrix |
 pub(crate) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>) -> u64 {
     let geometry = exposures.geometry();
