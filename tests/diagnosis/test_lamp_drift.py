@@ -130,8 +130,30 @@ def test_sensors_turned_alike_see_the_same_drift():
 
 
 def test_the_covariance_of_slopes_has_their_standard_deviations():
-    covariance = slope_covariance(SEVEN, 1e-3, None)
+    covariance = slope_covariance(SEVEN, 1e-3, None, np.full(7, 5.0))
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), slope_std(SEVEN, 1e-3), rtol=1e-12)
+    # An exposure of no weight is as one that is not there.
+    light = slope_covariance(SEVEN, 1e-3, None, np.array([1, 1, 1, 1, 1, 1, 1e-12]))
+    np.testing.assert_allclose(light, slope_covariance(SEVEN[:6], 1e-3, None, np.ones(6)), 1e-9)
+
+
+@pytest.mark.parametrize("drift", [0.0, 1e-3])
+def test_a_noisy_exposure_hides_no_drift_and_feigns_none(drift):
+    """The first exposure has a hundred times the noise; six others leave three combinations."""
+    variance = np.full(7, NOISE**2)
+    variance[0] *= 1e4
+    options = Options(FitOptions(tolerance=1e-6))
+    for seed in range(8):
+        rng = np.random.default_rng([2, seed])
+        frames, _, _ = photograph(rng, drift)
+        frames[0] += 100 * NOISE * rng.standard_normal(SENSOR)
+        weighted = weighted_fit(exposures_of(frames, SEVEN, variance=variance), options)
+        found = lamp_drift(weighted, sampled(weighted))
+        # χ² of three is below 0.0075 or above 20.3 in one of 3000.
+        if drift:
+            assert 0.05 * drift < found.size < 2.6 * drift
+        else:
+            assert found.size <= 2.5 * found.flux_std
 
 
 @pytest.mark.parametrize(

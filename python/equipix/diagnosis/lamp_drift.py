@@ -19,6 +19,12 @@ _WARNED = 1e-3
 _VISIBLE = 1e-6
 """Share of the variance of a trend below which what it leaves is rounding."""
 
+_LEAST = 1e-6
+"""Share of the least variance of a flux below which an ε² is as good as 0."""
+
+_POINTS, _ROUNDS = 41, 4
+"""Points at which the likelihood is compared, and rounds, each between those beside the best."""
+
 _BLOCK, _FAR = 16, 5.0
 """Columns of a block, and how many standard deviations off it is left out."""
 
@@ -33,7 +39,8 @@ class Drift(ReadOnly):
         Standard deviation ε of ln c of an exposure about what was given, that of noise subtracted;
         0 where the fluxes scatter no more than noise lets them.
     flux_std : float
-        Standard error of the flux of an exposure, by noise and by shifts that were not refined.
+        Standard error of the flux of an exposure of mean weight, by noise and by shifts that were
+        not refined.
     degrees_of_freedom : int
         Number of combinations of fluxes that leave a residual, n − 3 (n − 4 for a linear trend).
         Errors of the tilt over its standard deviation are at most as far out as those of Student's
@@ -66,7 +73,7 @@ class Drift(ReadOnly):
     @property
     def is_certain(self) -> bool:
         """Whether the data contradict the fluxes: `calibrate` warns."""
-        return self.probability < _WARNED
+        return self.is_added and self.probability < _WARNED
 
     @property
     def words(self) -> str:
@@ -133,13 +140,17 @@ def lamp_drift(weighted: Weighted, residuals: Residuals) -> Drift | None:
     -----
     One linearised step with free fluxes. The slope of F gives b_k = Σ w m (y − m), m = c L M being
     the expected signal, and the step is v = b/S, S_k = Σ w m² t. The share t of a measurement that
-    the beam does not take is (1 − 1/j)/(1 − 1/n), with j exposures that see its cell. Errors of
-    ln c that are affine in the shifts leave no residual: with P the projector on the other f
-    combinations, ε² = |P v|²/f less the variance of v. Without drift the sum of squares of P v over
-    their variances follows χ² of f degrees of freedom. The variance of v is that of noise and that
-    of shifts which have a prior and were not refined: the square of the mean slope of ln L times
-    the variance of the shift. Sums are over blocks of pixels; one whose own flux is far from the
-    median of its exposure is left out, so that dust looks like no drift.
+    the beam does not take is (1 − ω/Σω)/(1 − ω/Ω), with Σω the weight of all exposures that see its
+    cell and Ω that of all. Errors of ln c that are affine in the shifts leave no residual. What
+    they leave of v, each exposure over its standard error, has a sum of squares that without drift
+    follows χ² of as many degrees of freedom f as there are other combinations. ε² is what, added to
+    all variances of v, makes what is left most likely (restricted maximum likelihood, Patterson and
+    Thompson, Biometrika 58 (1971) 545): where these are all V it is |P v|²/f − V, with P the
+    projector on those combinations, and a noisy exposure neither hides nor feigns a drift of the
+    others. The variance of v is that of noise and that of shifts which have a prior and were not
+    refined: the square of the mean slope of ln L times the variance of the shift. Sums are over
+    blocks of pixels; one whose own flux is far from the median of its exposure is left out, so that
+    dust looks like no drift.
     """
     exposures, fit = weighted.exposures, weighted.fit
     if exposures.offset or exposures.positions.are_turned:
@@ -156,19 +167,47 @@ def lamp_drift(weighted: Weighted, residuals: Residuals) -> Drift | None:
     fluxes, variances = _free_fluxes(residuals, shifts, exposures.shape)
     if not np.isfinite(variances).all():
         return None
+    weights = 1 / variances
     variances *= max(residuals.scale, weighted.reduced_chi2)
     variances += _solver_error(fit.error_estimate[-1], shifts, exposures.shape) ** 2
     variances += flux_variance(weighted, residuals)
-    roots = np.sqrt(variances)
-    scatter = left_by(columns / roots[:, None], fluxes / roots)[0]
-    flux_std = float(np.sqrt(variances.mean()))
-    rest = left_by(columns, fluxes)[0]
-    size = max(0.0, float(rest @ rest) / freedom - flux_std**2) ** 0.5
-    covariance = slope_covariance(shifts, size, exposures.flux.time)
+    flux_std = float(1 / np.sqrt(np.mean(1 / variances)))
+    size = _size(columns, fluxes, variances)
+    covariance = slope_covariance(shifts, size, exposures.flux.time, weights)
     tilt = np.sqrt(np.diag(covariance)) * exposures.shape
-    probability = chi2_tail(float(scatter @ scatter), freedom)
+    probability = chi2_tail(_scatter(columns, fluxes, variances), freedom)
+    rest = left_by(columns, fluxes)[0]
     trend = np.abs(_slope_of_trend(columns, rest, exposures.flux.time)) * exposures.shape
     return Drift(size, flux_std, freedom, probability, covariance, tilt, trend)
+
+
+def _scatter(columns: Floats, fluxes: Floats, variances: Floats) -> float:
+    """Sum of squares over their variances of what columns leave of fluxes."""
+    roots = np.sqrt(variances)
+    left = left_by(columns / roots[:, None], fluxes / roots)[0]
+    return float(left @ left)
+
+
+def _size(columns: Floats, fluxes: Floats, variances: Floats) -> float:
+    """The ε of the largest restricted likelihood; 0 if noise is enough."""
+
+    def unlikely(square: float) -> float:
+        total = variances + square
+        information = np.linalg.slogdet(columns.T @ (columns / total[:, None]))[1]
+        return float(np.sum(np.log(total)) + information + _scatter(columns, fluxes, total))
+
+    # None is larger than that without noise.
+    largest = _scatter(columns, fluxes, np.ones(len(fluxes))) / (len(fluxes) - columns.shape[1])
+    least = _LEAST * float(variances.min())
+    if largest <= least:
+        return 0.0
+    squares = np.concatenate([[0.0], np.geomspace(least, largest, _POINTS)])
+    for _ in range(_ROUNDS):
+        best = int(np.argmin([unlikely(square) for square in squares]))
+        found = float(squares[best])
+        around = squares[max(best - 1, 0)], squares[min(best + 1, len(squares) - 1)]
+        squares = np.linspace(*around, _POINTS)
+    return found**0.5 if found > least else 0.0
 
 
 def with_hidden_tilt(bars: ErrorBars, drift: Drift, response: Floats) -> ErrorBars:
@@ -186,7 +225,10 @@ def _free_fluxes(
     """Errors of ln c as given, and their variances where a value of weight 1 has variance 1."""
     known = np.isfinite(residuals.values)
     signal = np.where(known, residuals.signal, 0)
-    share = testable(residuals.rows, shifts, shape)
+    weights = np.sum(signal**2, axis=(1, 2, 3)) / np.maximum(known.sum(axis=(1, 2, 3)), 1)
+    if not weights.all():
+        return np.zeros(len(shifts)), np.full(len(shifts), np.inf)
+    share = testable(residuals.rows, shifts, shape, weights)
     places = np.arange(0, shape[1], _BLOCK)
     strengths, slopes = (
         np.add.reduceat(each.sum(axis=2), places, axis=2)

@@ -426,7 +426,9 @@ def _seen_by_all(weighted: Weighted, residuals: Residuals) -> Bools:
     positions, shape = weighted.exposures.positions, weighted.exposures.shape
     if positions.are_turned:
         return np.isfinite(residuals.values)
-    return np.asarray(testable(residuals.rows, on_sensor(positions), shape) > 1 - 1e-9)
+    return np.asarray(
+        testable(residuals.rows, on_sensor(positions), shape, np.ones(len(positions))) > 1 - 1e-9
+    )
 
 
 def _flat(image: Array) -> Array:

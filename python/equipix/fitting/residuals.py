@@ -204,8 +204,12 @@ def left_by(columns: Array, values: Array) -> tuple[Floats, int]:
     return np.asarray(values - columns @ found), int(rank)
 
 
-def testable(rows: Array, shifts: Floats, shape: tuple[int, int]) -> Floats:
-    """Share of each measurement (n, bands, rows, cols) that the beam does not take."""
+def testable(rows: Array, shifts: Floats, shape: tuple[int, int], weights: Floats) -> Floats:
+    """Share of each measurement (n, bands, rows, cols) that the beam does not take.
+
+    It is 1 − ω/Σω over the exposures, of these weights, that see its cell, in units of that over
+    all: 1 where all see it.
+    """
     count = len(shifts)
     moves = nearest_whole(shifts[:, None] - shifts)
     seen = []
@@ -213,8 +217,9 @@ def testable(rows: Array, shifts: Floats, shape: tuple[int, int]) -> Floats:
         at = places + moves[..., axis, None]
         seen.append(((at >= 0) & (at < shape[axis])).astype(np.float64))
     # Each exposure sees its own cells.
-    seers = np.einsum("kjr,kjc->krc", *seen).reshape(count, *rows.shape, shape[1])
-    return np.asarray((1 - 1 / seers) / (1 - 1 / count))
+    seers = np.einsum("kjr,kjc,j->krc", *seen, weights).reshape(count, *rows.shape, shape[1])
+    own = weights[:, None, None, None]
+    return np.asarray((1 - own / seers) / (1 - own / weights.sum()))
 
 
 _CLIPPED = 4.0

@@ -65,7 +65,9 @@ def slope_std(shifts: Array, flux_std: ArrayLike) -> Floats:
     return np.asarray(found)
 
 
-def slope_covariance(shifts: Array, flux_std: float, times: ArrayLike | None) -> Floats:
+def slope_covariance(
+    shifts: Array, flux_std: float, times: ArrayLike | None, weights: Floats
+) -> Floats:
     """Covariance of the slope of ln M, per pixel, that independent errors of the fluxes leave.
 
     Parameters
@@ -76,14 +78,18 @@ def slope_covariance(shifts: Array, flux_std: float, times: ArrayLike | None) ->
         Standard deviation of ln c of each exposure.
     times : array_like, shape (n,), or None
         When each exposure was taken, where a trend of ln c linear in time was fitted.
+    weights : ndarray, shape (n,)
+        Weight of each exposure in the fit: a light one follows the slope that the others set.
 
     Returns
     -------
     ndarray, shape (2, 2), float64
-        Part of ε² (XᵀX)⁻¹ for the shifts, the columns of X being 1, the shifts, and the times.
+        Part of ε² HHᵀ for the shifts, H = (XᵀWX)⁻¹XᵀW, the columns of X being 1, the shifts, and
+        the times.
     """
-    columns = affine_columns(shifts, times)
-    return np.asarray(flux_std**2 * np.linalg.inv(columns.T @ columns)[1:3, 1:3])
+    roots = np.sqrt(weights / weights.max())
+    slopes = np.linalg.pinv(affine_columns(shifts, times) * roots[:, None])[1:3] * roots
+    return np.asarray(flux_std**2 * slopes @ slopes.T)
 
 
 def affine_columns(shifts: Array, times: ArrayLike | None) -> Floats:

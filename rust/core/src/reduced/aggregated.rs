@@ -194,8 +194,9 @@ mod tests {
     use crate::weak_light::Prior;
 
     const SENSOR: Shape = Shape::new(23, 31);
-    /// Far apart, so that pixels see cells alone, and one cell of two exposures each in places.
-    const SHIFTS: [[f64; 2]; 4] = [[0.0, 0.0], [7.0, -12.0], [-9.0, 5.0], [3.0, 16.0]];
+    /// Far apart, so that pixels see cells alone, and one cell of two exposures each in places; two are at one.
+    const SHIFTS: [[f64; 2]; 5] =
+        [[0.0, 0.0], [7.0, -12.0], [-9.0, 5.0], [3.0, 16.0], [7.0, -12.0]];
 
     #[test]
     fn strong_neighbours_are_those_of_much_weight() {
@@ -235,7 +236,7 @@ mod tests {
         let variance: Vec<f64> = (0..count).map(|at| 1e-3 * positive(at + 99_000)).collect();
         let masked: Vec<bool> = (0..count).map(|at| random_number(at + 5) > 0.9).collect();
         let stack = |values| Stack::new("frames", values, SHIFTS.len(), SENSOR).unwrap();
-        let whole = [Variance::Unknown, Variance::Exposures(&[4e-6, 9e-5, 5e-7, 1e-6])];
+        let whole = [Variance::Unknown, Variance::Exposures(&[4e-6, 9e-5, 5e-7, 1e-6, 8e-7])];
         let cases = [
             (whole[0], Mask::None),
             (whole[1], Mask::None),
@@ -244,7 +245,7 @@ mod tests {
         ];
         for (variance, mask) in cases {
             let measurements = Measurements { frames: stack(&frames), variance, mask };
-            let flux = Flux { values: vec![1.0, 0.7, 1.6, 0.4], kind: FluxKind::Known };
+            let flux = Flux { values: vec![1.0, 0.7, 1.6, 0.4, 1.2], kind: FluxKind::Known };
             let positions = Positions::of_shifts(&SHIFTS);
             let exposures =
                 Exposures::new(measurements, positions, flux, false, &workers, &control).unwrap();
