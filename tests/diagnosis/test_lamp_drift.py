@@ -9,14 +9,15 @@ import pytest
 
 import equipix
 from equipix import simulate
+from equipix.diagnosis import lamp_drift as lamp_drift_module
 from equipix.diagnosis.lamp_drift import lamp_drift
 from equipix.errors import MisfitWarning
 from equipix.exposures.exposures import FitOptions
-from equipix.fitting.residuals import sampled
+from equipix.fitting.residuals import left_by, sampled
 from equipix.fitting.weighted import Options, weighted_fit
 from equipix.measured.noise import chi2_tail
 from equipix.metrics.maps import tilt, tilt_weights
-from equipix.plan.drift import distinct_trend, slope_covariance, slope_std
+from equipix.plan.drift import affine_columns, distinct_trend, slope_covariance, slope_std
 from given import exposures_of
 
 SENSOR, NOISE = (48, 64), 1e-3
@@ -149,11 +150,50 @@ def test_a_noisy_exposure_hides_no_drift_and_feigns_none(drift):
         frames[0] += 100 * NOISE * rng.standard_normal(SENSOR)
         weighted = weighted_fit(exposures_of(frames, SEVEN, variance=variance), options)
         found = lamp_drift(weighted, sampled(weighted))
+        assert found.degrees_of_freedom in (3, 4) if drift else found.degrees_of_freedom == 3
         # χ² of three is below 0.0075 or above 20.3 in one of 3000.
-        if drift:
-            assert 0.05 * drift < found.size < 2.6 * drift
-        else:
-            assert found.size <= 2.5 * found.flux_std
+        error = NOISE / np.mean(frames[1:]) / np.sqrt(frames[0].size)
+        low, high = (0.05 * drift, 2.6 * drift) if drift else (0, 2.5 * error)
+        assert low <= found.size < high
+        assert found.is_certain == bool(drift)
+        # The six others make the slope.
+        others = slope_covariance(SEVEN[1:], found.size, None, np.ones(6))
+        np.testing.assert_allclose(
+            found.tilt_std, np.sqrt(np.diag(others)) * SENSOR, rtol=0.2 if drift else 0.1
+        )
+
+
+def test_one_noisy_exposure_that_is_wrong_is_no_drift_of_the_lamp():
+    """Its flux is off by twenty of its own standard errors, that of no other."""
+    variance = np.full(7, NOISE**2)
+    variance[0] *= 1e4
+    rng = np.random.default_rng(5)
+    frames, _, _ = photograph(rng, 0.0)
+    frames[0] = 1.04 * frames[0] + 100 * NOISE * rng.standard_normal(SENSOR)
+    weighted = weighted_fit(
+        exposures_of(frames, SEVEN, variance=variance), Options(FitOptions(tolerance=1e-6))
+    )
+    found = lamp_drift(weighted, sampled(weighted))
+    assert found.probability < 1e-10
+    assert not found.is_certain
+
+
+def test_the_size_is_that_of_the_largest_restricted_likelihood():
+    columns = affine_columns(SEVEN, None)
+    rng = np.random.default_rng(1)
+    fluxes = 5 * rng.standard_normal(7)
+    # Of equal variances: what is left, for each combination, less the variance.
+    left = left_by(columns, fluxes)[0]
+    assert lamp_drift_module._size(columns, fluxes, np.ones(7)) ** 2 == pytest.approx(
+        left @ left / 4 - 1, rel=1e-3
+    )
+    assert lamp_drift_module._size(columns, fluxes / 1e3, np.ones(7)) == 0
+    # Of an exposure of no weight nothing is known: as without it.
+    variances = np.array([1, 1, 1, 1, 1, 1, 1e12])
+    left = left_by(columns[:6], fluxes[:6])[0]
+    assert lamp_drift_module._size(columns, fluxes, variances) ** 2 == pytest.approx(
+        left @ left / 3 - 1, rel=1e-3
+    )
 
 
 @pytest.mark.parametrize(

@@ -5,13 +5,18 @@ from typing import Annotated
 
 import numpy as np
 
-from equipix._check import Array, Bools, Floats, ReadOnly
+from equipix._check import Bools, Floats, ReadOnly
 from equipix.fitting.error_bars import ErrorBars
 from equipix.fitting.residuals import EXACT, FEWEST, Residuals, left_by, on_sensor, testable
 from equipix.fitting.stated_errors import flux_variance
 from equipix.fitting.weighted import Weighted
 from equipix.measured.noise import ROBUST, chi2_tail
-from equipix.plan.drift import affine_columns, slope_covariance, unit_times
+from equipix.plan.drift import (
+    affine_columns,
+    slope_covariance,
+    slopes_by_fluxes,
+    unit_times,
+)
 
 _WARNED = 1e-3
 """Probability of a scatter of fluxes without drift below which `calibrate` warns."""
@@ -19,7 +24,7 @@ _WARNED = 1e-3
 _VISIBLE = 1e-6
 """Share of the variance of a trend below which what it leaves is rounding."""
 
-_LEAST = 1e-6
+_LEAST = 1e-3
 """Share of the least variance of a flux below which an ε² is as good as 0."""
 
 _POINTS, _ROUNDS = 41, 4
@@ -42,10 +47,12 @@ class Drift(ReadOnly):
         Standard error of the flux of an exposure of mean weight, by noise and by shifts that were
         not refined.
     degrees_of_freedom : int
-        Number of combinations of fluxes that leave a residual, n − 3 (n − 4 for a linear trend).
-        Errors of the tilt over its standard deviation are at most as far out as those of Student's
-        t with so many: as t where the drift is above five standard errors, and between that and
-        the normal law where it is smaller.
+        Number of combinations of fluxes that leave a residual, n − 3 (n − 4 for a linear trend),
+        less those that noisy exposures alone show: (tr Q)²/tr Q², rounded, with Q what the columns
+        of errors without a residual leave of the identity, over the variances of fluxes. Errors of
+        the tilt over its standard deviation are at most as far out as those of Student's t with so
+        many: as t where the drift is above five standard errors, and between that and the normal
+        law where it is smaller.
     probability : float
         That fluxes scatter so much without drift.
     slope_covariance : ndarray, shape (2, 2)
@@ -73,7 +80,10 @@ class Drift(ReadOnly):
     @property
     def is_certain(self) -> bool:
         """Whether the data contradict the fluxes: `calibrate` warns."""
-        return self.is_added and self.probability < _WARNED
+        # Of like exposures the second is the first; a noisy one alone is no drift of the lamp.
+        freedom = self.degrees_of_freedom
+        of_size = chi2_tail(freedom * (1 + (self.size / self.flux_std) ** 2), freedom)
+        return max(self.probability, of_size) < _WARNED
 
     @property
     def words(self) -> str:
@@ -176,9 +186,12 @@ def lamp_drift(weighted: Weighted, residuals: Residuals) -> Drift | None:
     covariance = slope_covariance(shifts, size, exposures.flux.time, weights)
     tilt = np.sqrt(np.diag(covariance)) * exposures.shape
     probability = chi2_tail(_scatter(columns, fluxes, variances), freedom)
-    rest = left_by(columns, fluxes)[0]
-    trend = np.abs(_slope_of_trend(columns, rest, exposures.flux.time)) * exposures.shape
-    return Drift(size, flux_std, freedom, probability, covariance, tilt, trend)
+    total = variances + size**2
+    trend = np.zeros(2)
+    if exposures.flux.time is None:
+        trend = np.abs(_slope_of_trend(columns, fluxes, total, weights)) * exposures.shape
+    known = _combinations(columns, total)
+    return Drift(size, flux_std, known, probability, covariance, tilt, trend)
 
 
 def _scatter(columns: Floats, fluxes: Floats, variances: Floats) -> float:
@@ -188,22 +201,34 @@ def _scatter(columns: Floats, fluxes: Floats, variances: Floats) -> float:
     return float(left @ left)
 
 
+def _combinations(columns: Floats, variances: Floats) -> int:
+    """Combinations of fluxes that show how they scatter, all of one variance counting as f."""
+    roots = np.sqrt(variances)
+    axes = np.linalg.qr(columns / roots[:, None])[0]
+    left = (np.eye(len(roots)) - axes @ axes.T) / (roots[:, None] * roots)
+    return max(1, round(float(np.trace(left) ** 2 / np.sum(left**2))))
+
+
 def _size(columns: Floats, fluxes: Floats, variances: Floats) -> float:
-    """The ε of the largest restricted likelihood; 0 if noise is enough."""
+    """The ε of the first maximum of the restricted likelihood; 0 if noise is enough."""
 
     def unlikely(square: float) -> float:
         total = variances + square
-        information = np.linalg.slogdet(columns.T @ (columns / total[:, None]))[1]
+        # Not the determinant of a product: noisy exposures may have next to no weight.
+        corner = np.linalg.qr(columns / np.sqrt(total)[:, None], mode="r")
+        information = 2 * np.sum(np.log(np.abs(np.diag(corner))))
         return float(np.sum(np.log(total)) + information + _scatter(columns, fluxes, total))
 
-    # None is larger than that without noise.
-    largest = _scatter(columns, fluxes, np.ones(len(fluxes))) / (len(fluxes) - columns.shape[1])
+    # Beyond the whole sum of squares the likelihood falls.
+    largest = _scatter(columns, fluxes, np.ones(len(fluxes)))
     least = _LEAST * float(variances.min())
     if largest <= least:
         return 0.0
     squares = np.concatenate([[0.0], np.geomspace(least, largest, _POINTS)])
     for _ in range(_ROUNDS):
-        best = int(np.argmin([unlikely(square) for square in squares]))
+        # The first minimum: one noisy exposure that is wrong makes another, of a drift of all.
+        rises = np.diff([unlikely(square) for square in squares]) > 0
+        best = int(np.argmax(rises)) if rises.any() else len(rises)
         found = float(squares[best])
         around = squares[max(best - 1, 0)], squares[min(best + 1, len(squares) - 1)]
         squares = np.linspace(*around, _POINTS)
@@ -226,7 +251,7 @@ def _free_fluxes(
     known = np.isfinite(residuals.values)
     signal = np.where(known, residuals.signal, 0)
     weights = np.sum(signal**2, axis=(1, 2, 3)) / np.maximum(known.sum(axis=(1, 2, 3)), 1)
-    if not weights.all():
+    if np.count_nonzero(weights) < len(weights):
         return np.zeros(len(shifts)), np.full(len(shifts), np.inf)
     share = testable(residuals.rows, shifts, shape, weights)
     places = np.arange(0, shape[1], _BLOCK)
@@ -253,13 +278,14 @@ def _agreeing(strengths: Floats, slopes: Floats) -> Bools:
     return np.asarray(known & (distances <= _FAR * scale))
 
 
-def _slope_of_trend(columns: Floats, rest: Floats, time: Array | None) -> Floats:
-    """Slope of ln M (row, col) that a trend in the order of exposures hides if it leaves `rest`."""
+def _slope_of_trend(columns: Floats, fluxes: Floats, variances: Floats, weights: Floats) -> Floats:
+    """Slope of ln M (row, col) that a trend in the order of exposures hides if it leaves these."""
+    roots = np.sqrt(variances)
     order = unit_times(np.arange(len(columns)))
-    visible = left_by(columns, order)[0]
-    if time is not None or not visible @ visible > _VISIBLE:
+    visible, rest = (left_by(columns / roots[:, None], each / roots)[0] for each in (order, fluxes))
+    if not visible @ visible > _VISIBLE * np.sum((order / roots) ** 2):
         return np.zeros(2)
-    hidden = np.linalg.lstsq(columns, order, rcond=None)[0][1:3]
+    hidden = slopes_by_fluxes(columns, weights) @ order
     return np.asarray(hidden * (visible @ rest) / (visible @ visible))
 
 

@@ -208,7 +208,7 @@ def testable(rows: Array, shifts: Floats, shape: tuple[int, int], weights: Float
     """Share of each measurement (n, bands, rows, cols) that the beam does not take.
 
     It is 1 − ω/Σω over the exposures, of these weights, that see its cell, in units of that over
-    all: 1 where all see it.
+    all: 1 where all see it. At least two weights are above 0.
     """
     count = len(shifts)
     moves = nearest_whole(shifts[:, None] - shifts)
@@ -217,9 +217,14 @@ def testable(rows: Array, shifts: Floats, shape: tuple[int, int], weights: Float
         at = places + moves[..., axis, None]
         seen.append(((at >= 0) & (at < shape[axis])).astype(np.float64))
     # Each exposure sees its own cells.
-    seers = np.einsum("kjr,kjc,j->krc", *seen, weights).reshape(count, *rows.shape, shape[1])
-    own = weights[:, None, None, None]
-    return np.asarray((1 - own / seers) / (1 - own / weights.sum()))
+    shares = weights * (1 - np.eye(count)), weights + np.zeros((count, 1))
+    others, all_of_them = (
+        np.einsum("kjr,kjc,kj->krc", *seen, share).reshape(count, *rows.shape, shape[1])
+        for share in shares
+    )
+    # Not as a difference from 1: one exposure may have nearly all the weight.
+    most = (shares[0].sum(axis=1) / weights.sum())[:, None, None, None]
+    return np.asarray(others / all_of_them / most)
 
 
 _CLIPPED = 4.0

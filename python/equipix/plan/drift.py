@@ -87,9 +87,14 @@ def slope_covariance(
         Part of ε² HHᵀ for the shifts, H = (XᵀWX)⁻¹XᵀW, the columns of X being 1, the shifts, and
         the times.
     """
-    roots = np.sqrt(weights / weights.max())
-    slopes = np.linalg.pinv(affine_columns(shifts, times) * roots[:, None])[1:3] * roots
+    slopes = slopes_by_fluxes(affine_columns(shifts, times), weights)
     return np.asarray(flux_std**2 * slopes @ slopes.T)
+
+
+def slopes_by_fluxes(columns: Floats, weights: Floats) -> Floats:
+    """What multiplies errors of ln c, (n,), to the slope of ln M (row, col) that they leave."""
+    roots = np.sqrt(weights / weights.max())
+    return np.asarray(np.linalg.pinv(columns * roots[:, None])[1:3] * roots)
 
 
 def affine_columns(shifts: Array, times: ArrayLike | None) -> Floats:
