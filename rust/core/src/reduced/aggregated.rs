@@ -156,7 +156,7 @@ impl<T: Real> Edges for Pixels<'_, '_, '_, T> {
         for source in &self.sources {
             let cell = pixel + source.behind;
             let share = f64::from(self.reduced.share_of_cell(cell));
-            // Of a cell that only the weakest measurements see, 1/Σ w c² M² may be infinite.
+            // Of a cell that only the weakest measurements see, L²/Σ w c² M² may be infinite.
             if !(share > 0.0 && share.is_finite()) {
                 continue;
             }
@@ -236,7 +236,7 @@ mod tests {
         let variance: Vec<f64> = (0..count).map(|at| 1e-3 * positive(at + 99_000)).collect();
         let masked: Vec<bool> = (0..count).map(|at| random_number(at + 5) > 0.9).collect();
         let stack = |values| Stack::new("frames", values, SHIFTS.len(), SENSOR).unwrap();
-        let whole = [Variance::Unknown, Variance::Exposures(&[4e-6, 9e-5, 5e-7, 1e-6, 8e-7])];
+        let whole = [Variance::Unknown, Variance::Exposures(&[4e-6, 9e-5, 5e-7, 1e-6, 2e-4])];
         let cases = [
             (whole[0], Mask::None),
             (whole[1], Mask::None),
