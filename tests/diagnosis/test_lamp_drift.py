@@ -178,7 +178,7 @@ def test_one_noisy_exposure_that_is_wrong_is_no_drift_of_the_lamp():
     assert not found.is_certain
 
 
-def test_the_size_is_that_of_the_largest_restricted_likelihood():
+def test_the_size_is_that_of_the_first_maximum_of_the_restricted_likelihood():
     columns = affine_columns(SEVEN, None)
     rng = np.random.default_rng(1)
     fluxes = 5 * rng.standard_normal(7)

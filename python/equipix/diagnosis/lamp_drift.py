@@ -154,13 +154,13 @@ def lamp_drift(weighted: Weighted, residuals: Residuals) -> Drift | None:
     cell and Ω that of all. Errors of ln c that are affine in the shifts leave no residual. What
     they leave of v, each exposure over its standard error, has a sum of squares that without drift
     follows χ² of as many degrees of freedom f as there are other combinations. ε² is what, added to
-    all variances of v, makes what is left most likely (restricted maximum likelihood, Patterson and
-    Thompson, Biometrika 58 (1971) 545): where these are all V it is |P v|²/f − V, with P the
-    projector on those combinations, and a noisy exposure neither hides nor feigns a drift of the
-    others. The variance of v is that of noise and that of shifts which have a prior and were not
-    refined: the square of the mean slope of ln L times the variance of the shift. Sums are over
-    blocks of pixels; one whose own flux is far from the median of its exposure is left out, so that
-    dust looks like no drift.
+    all variances of v, makes what is left most likely (the first maximum of the restricted
+    likelihood, Patterson and Thompson, Biometrika 58 (1971) 545): where these are all V it is
+    |P v|²/f − V, with P the projector on those combinations, and a noisy exposure neither hides nor
+    feigns a drift of the others. The variance of v is that of noise and that of shifts which have a
+    prior and were not refined: the square of the mean slope of ln L times the variance of the
+    shift. Sums are over blocks of pixels; one whose own flux is far from the median of its exposure
+    is left out, so that dust looks like no drift.
     """
     exposures, fit = weighted.exposures, weighted.fit
     if exposures.offset or exposures.positions.are_turned:
@@ -251,7 +251,7 @@ def _free_fluxes(
     known = np.isfinite(residuals.values)
     signal = np.where(known, residuals.signal, 0)
     weights = np.sum(signal**2, axis=(1, 2, 3)) / np.maximum(known.sum(axis=(1, 2, 3)), 1)
-    if np.count_nonzero(weights) < len(weights):
+    if not weights.all():
         return np.zeros(len(shifts)), np.full(len(shifts), np.inf)
     share = testable(residuals.rows, shifts, shape, weights)
     places = np.arange(0, shape[1], _BLOCK)
