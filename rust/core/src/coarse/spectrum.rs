@@ -26,6 +26,11 @@ pub(crate) const MOST_WAVES: usize = 4;
 /// Steps over the wave vectors along an axis, for each pixel that shifts reach, and at least and at most.
 const STEPS_A_PIXEL: usize = 8;
 const STEPS: [usize; 2] = [16, 512];
+/// At such a share of `below` each wave vector delays conjugate gradients, and not the minimum alone.
+const NEARLY_ZERO: f64 = 0.05;
+/// Places of the scan, over half of all wave vectors, that the hats around all waves hold: those of one wave,
+/// three times the reach apart, are as many as one in 9 of the pixels that the reach spans.
+const HELD: usize = MOST_WAVES * STEPS_A_PIXEL * STEPS_A_PIXEL / 9 / 2;
 /// How often the steps are halved to come to a minimum: λ is then off by some 1e-7, so that a wave that is not
 /// determined at all is recognised.
 const HALVINGS: usize = 12;
@@ -59,6 +64,8 @@ pub(crate) struct BarelyConstrained {
     pub(crate) share: f64,
     /// A quarter of λ's mean over waves whose phases at the exposures have nothing in common.
     pub(crate) below: f64,
+    /// Whether λ is nearly 0, and not 0, at more wave vectors than the hats around so many waves hold.
+    pub(crate) is_beyond_waves: bool,
 }
 
 /// Those of exposures of these shares that reach so many pixels, and hats so far apart: the hats around one
@@ -91,8 +98,13 @@ pub(crate) fn barely_constrained(
         }
     }
     let below = (1.0 - shares.iter().map(|share| share * share).sum::<f64>()) / 4.0;
-    let count = scan.depths.iter().filter(|&&depth| depth < below).count();
-    BarelyConstrained { waves, share: count as f64 / scan.depths.len() as f64, below }
+    let deeper = |limit: f64| scan.depths.iter().filter(|&&depth| depth < limit).count();
+    BarelyConstrained {
+        waves,
+        share: deeper(below) as f64 / scan.depths.len() as f64,
+        below,
+        is_beyond_waves: deeper(NEARLY_ZERO * below) - deeper(DETERMINED) > HELD,
+    }
 }
 
 /// A wave vector between −π and π.
@@ -238,6 +250,22 @@ mod tests {
                 assert!(lambda(&cross, q) > depths[MOST_WAVES - 1] - 1e-2, "{q:?}");
             }
         }
+    }
+
+    #[test]
+    fn valleys_are_beyond_waves() {
+        let cross = [[0.0, 0.0], [0.0, 11.0], [0.0, 19.0], [11.0, 0.0], [19.0, 0.0]];
+        // Lattices leave single waves at which λ is 0.
+        let lattice = cross.map(|shift| shift.map(|d| if d == 19.0 { 22.0 } else { d }));
+        let of = |shifts: &[[f64; 2]], heavy: usize, light: f64| {
+            let shares: Vec<f64> = (0..5).map(|k| if k < heavy { 1.0 } else { light }).collect();
+            let total: f64 = shares.iter().sum();
+            let shares: Vec<f64> = shares.iter().map(|share| share / total).collect();
+            barely_constrained(&Shifts(shifts), &shares, [22, 22], [66.0; 2]).is_beyond_waves
+        };
+        assert!(!of(&cross, 5, 1.0) && !of(&lattice, 5, 1.0));
+        // The first three are on a line.
+        assert!(of(&cross, 3, 1e-2) && of(&cross, 2, 1e-4) && !of(&cross, 4, 1e-4));
     }
 
     #[test]

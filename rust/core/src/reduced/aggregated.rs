@@ -2,9 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use super::blocks::distinct;
+use super::blocks::{Places, least_strong};
 use super::operator::{Input, Reduced};
-use crate::coarse::{Cycle, Edges, Graph, NONE, Partition, STRONG};
+use crate::coarse::{Cycle, Edges, Graph, NONE, Partition};
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
@@ -98,16 +98,12 @@ struct Source {
 
 impl Source {
     fn all<T: Real>(reduced: &Reduced<'_, '_, T>) -> Vec<Self> {
-        let placements = &reduced.exposures.geometry().placements;
-        let shares = reduced.exposures.shares();
-        let alike = distinct(placements).into_iter();
-        alike
-            .map(|exposures| Self {
-                behind: {
-                    let place = &placements[exposures[0]];
-                    place.row * reduced.padding.width + place.col
-                },
-                share: exposures.iter().map(|&exposure| shares[exposure]).sum(),
+        let Places { at, exposures, shares } = Places::of(reduced.exposures);
+        let places = at.into_iter().zip(exposures).zip(shares);
+        places
+            .map(|(([row, col], exposures), share)| Self {
+                behind: row * reduced.padding.width + col,
+                share,
                 uniform: exposures.iter().map(|&one| reduced.uniform_weight(one)).sum(),
                 exposures,
             })
@@ -130,7 +126,7 @@ fn apart(sources: &[Source]) -> [Vec<(usize, f64)>; 2] {
         let largest = apart.entry(distance).or_insert(0.0);
         *largest = largest.max(weight);
     }
-    let least = apart.values().map(|weight| STRONG * weight).fold(0.0, f64::max);
+    let least = least_strong(&sources.iter().map(|source| source.share).collect::<Vec<_>>());
     let (strong, weak) = apart.into_iter().partition(|&(_, weight)| weight >= least);
     [strong, weak]
 }

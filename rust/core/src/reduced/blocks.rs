@@ -33,27 +33,28 @@ impl ShortWaves {
         if geometry.views.len() > 1 {
             return Self::Waves(Vec::new());
         }
-        let all = Places(geometry.placements.iter().map(|place| [place.row, place.col]).collect());
-        let places = Places(
-            distinct(&geometry.placements).iter().map(|exposures| all.0[exposures[0]]).collect(),
-        );
-        let shares = shares_of_places(exposures);
+        let places = Places::of(exposures);
         let reach = [0, 1].map(|axis| {
-            let along = places.0.iter().map(|place| place[axis]);
+            let along = places.at.iter().map(|place| place[axis]);
             along.clone().max().unwrap_or(0) - along.min().unwrap_or(0)
         });
         let spacing = hats_of_waves(geometry);
         let spacing = [spacing.rows.spacing, spacing.cols.spacing];
-        let BarelyConstrained { waves, share, below } =
-            barely_constrained(&places, &shares, reach, spacing);
-        // λ is below t in an ellipse around each minimum, of the share t/(4π √det Σ) where it is deep.
-        if 4.0 * PI * places.spread(&shares) * share / below > MANY {
+        let BarelyConstrained { waves, share, below, is_beyond_waves } =
+            barely_constrained(&places, &places.shares, reach, spacing);
+        // λ is below t in an ellipse around each minimum, of the share t/(4π √det Σ) where it is deep. Where the
+        // places of most weight are on a line det Σ is nearly 0: there is no ellipse, but a valley.
+        if is_beyond_waves || 4.0 * PI * places.spread() * share / below > MANY {
             return Self::Aggregates;
         }
         let seen = waves.into_iter().map(|wave| {
             let [q, p] = wave.vector;
-            let factor = |k: usize| times(all.along(0, k, q), all.along(1, k, p));
-            SeenWave { wave, factors: (0..all.0.len()).map(factor).collect(), penalty: 0.0 }
+            let factor = |at: &Placement| times(phase(at.row, q), phase(at.col, p));
+            SeenWave {
+                wave,
+                factors: geometry.placements.iter().map(factor).collect(),
+                penalty: 0.0,
+            }
         });
         Self::Waves(seen.collect())
     }
@@ -72,23 +73,15 @@ impl ShortWaves {
 pub(super) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>, places: u64) -> u64 {
     let short = ShortWaves::of(exposures);
     let of_aggregates = if let ShortWaves::Aggregates = short {
-        let shares = shares_of_places(exposures);
-        let others = |one: usize| shares.iter().skip(one + 1).map(move |other| (one, other));
-        let pairs = || (0..shares.len()).flat_map(others).map(|(one, other)| shares[one] * other);
-        let least = STRONG * pairs().fold(0.0, f64::max);
-        let strong = pairs().filter(|&pair| pair >= least).count().max(1);
+        let shares = &Places::of(exposures).shares;
+        let others = |one: usize| shares.iter().skip(one + 1).map(move |other| shares[one] * other);
+        let pairs = || (0..shares.len()).flat_map(others);
+        let strong = pairs().filter(|&pair| pair >= least_strong(shares)).count().max(1);
         (12 + 4 * shares.len() * pairs().count() / strong) as u64 * places
     } else {
         0
     };
     coarse::bytes_needed(exposures.geometry(), short.waves().len()) + of_aggregates
-}
-
-/// The share of the exposures at each place in all weight.
-fn shares_of_places<T: Real>(exposures: &Exposures<'_, T>) -> Vec<f64> {
-    let shares = exposures.shares();
-    let places = distinct(&exposures.geometry().placements);
-    places.iter().map(|alike| alike.iter().map(|&one| shares[one]).sum()).collect()
 }
 
 fn hats_of_waves(geometry: &Geometry) -> Hats {
@@ -130,31 +123,40 @@ pub(super) fn coarse_spaces<T: Real>(
     Ok((coarse, waves))
 }
 
-/// The exposures at each place, in their order.
-pub(super) fn distinct(placements: &[Placement]) -> Vec<Vec<usize>> {
-    let mut found: Vec<Vec<usize>> = Vec::new();
-    for (exposure, place) in placements.iter().enumerate() {
-        let is_here = |other: &usize| {
-            let other = &placements[*other];
-            (other.row, other.col) == (place.row, place.col)
-        };
-        match found.iter_mut().find(|alike| is_here(&alike[0])) {
-            Some(alike) => alike.push(exposure),
-            None => found.push(vec![exposure]),
-        }
-    }
-    found
+/// The exposures at one place: for what they compare they are one.
+pub(super) struct Places {
+    /// Rows and columns.
+    pub(super) at: Vec<[usize; 2]>,
+    /// The exposures at each, in their order.
+    pub(super) exposures: Vec<Vec<usize>>,
+    /// Their share of all weight.
+    pub(super) shares: Vec<f64>,
 }
 
-/// Rows and columns of places.
-struct Places(Vec<[usize; 2]>);
-
 impl Places {
+    pub(super) fn of<T: Real>(all: &Exposures<'_, T>) -> Self {
+        let (mut at, mut exposures): (Vec<_>, Vec<Vec<usize>>) = (Vec::new(), Vec::new());
+        for (exposure, place) in all.geometry().placements.iter().enumerate() {
+            let place = [place.row, place.col];
+            match at.iter().position(|&other| other == place) {
+                Some(known) => exposures[known].push(exposure),
+                None => {
+                    at.push(place);
+                    exposures.push(vec![exposure]);
+                }
+            }
+        }
+        let each = all.shares();
+        let share = |alike: &Vec<usize>| alike.iter().map(|&exposure| each[exposure]).sum();
+        let shares = exposures.iter().map(share).collect();
+        Self { at, exposures, shares }
+    }
+
     /// √det Σ, with Σ the covariance of the shifts.
-    fn spread(&self, shares: &[f64]) -> f64 {
+    fn spread(&self) -> f64 {
         let at = |place: &[usize; 2]| place.map(|along| along as f64);
         let mean = |value: &dyn Fn([f64; 2]) -> f64| -> f64 {
-            self.0.iter().zip(shares).map(|(place, share)| share * value(at(place))).sum()
+            self.at.iter().zip(&self.shares).map(|(place, share)| share * value(at(place))).sum()
         };
         let [row, col] = [0, 1].map(|axis| mean(&|at| at[axis]));
         let of = |i: usize, j: usize| mean(&|at| (at[i] - [row, col][i]) * (at[j] - [row, col][j]));
@@ -165,13 +167,26 @@ impl Places {
 
 impl Symbol for Places {
     fn along(&self, axis: usize, place: usize, q: f64) -> Complex {
-        let (sin, cos) = (q * self.0[place][axis] as f64).sin_cos();
-        [cos, -sin]
+        phase(self.at[place][axis], q)
     }
 
     fn penalty(&self, _: f64) -> f64 {
         0.0
     }
+}
+
+/// e^{−iqd}.
+fn phase(shift: usize, q: f64) -> Complex {
+    let (sin, cos) = (q * shift as f64).sin_cos();
+    [cos, -sin]
+}
+
+/// The least weight of strong pairs of places of these shares: pixels that they compare are nearly alike in what
+/// exposures barely constrain.
+pub(super) fn least_strong(shares: &[f64]) -> f64 {
+    let mut falling = shares.to_vec();
+    falling.sort_by(|one, other| other.total_cmp(one));
+    STRONG * falling.iter().take(2).product::<f64>()
 }
 
 /// The blocks of cells, numbered row by row of the beam grid.
@@ -300,7 +315,12 @@ mod tests {
             assert!(!of(&CROSS, &variances).0, "{variances:?}");
             assert!(of(&FAR, &variances).0, "{variances:?}");
         }
-        // Along a line no minima can be told apart.
+        // Heavy ones on a line leave valleys.
+        for light in [1e-4, 1e-3, 1e-2] {
+            assert!(of(&CROSS, &[1e-6, 1e-6, light, light, light]).0, "{light}");
+            assert!(of(&CROSS, &[1e-6, 1e-6, 1e-6, light, light]).0, "{light}");
+        }
+        // Where all are on a line, none of equal weight do.
         let line = FAR.map(|[row, _]| [row, 2.0 * row]);
         assert!(!of(&line, &equal).0);
     }
