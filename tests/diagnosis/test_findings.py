@@ -125,7 +125,7 @@ def test_standard_deviations_are_missed_only_where_asked_for_after_a_joint_fit(
 @pytest.mark.parametrize(
     ("found", "remedy"),
     [
-        ({"ended": "stalled"}, "use a larger 'tolerance', or mask pixels that receive almost no"),
+        ({"ended": "stalled"}, "use a larger 'tolerance', more positions or closer ones, or mask"),
         ({"ended": "stalled", "error_estimate": np.array([2.0])}, "use more light or more frames"),
         ({"ended": "sweeps used"}, "allow more sweeps"),
     ],

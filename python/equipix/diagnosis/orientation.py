@@ -244,13 +244,13 @@ def _fits(
         odd = np.any([fit.outliers() for fit in fits.values()], axis=0)
         if odd.any():
             windows = {way: window.without(odd) for way, window in windows.items()}
-            fits = {way: WindowFit.of(window, options) for way, window in windows.items()}
+            starts = {way: fit.fit.start() for way, fit in fits.items()}
+            fits = {way: WindowFit.of(windows[way], options, starts[way]) for way in fits}
             continue
         unsettled = [way for way in _undecided(fits) if not fits[way].final]
         if not unsettled:
             break
-        finer = {way: WindowFit.of(windows[way], options, fits[way]) for way in unsettled}
-        fits |= finer
+        fits |= {way: fits[way].finer(windows[way], options) for way in unsettled}
     return fits
 
 

@@ -147,8 +147,8 @@ def _on_convergence(e: Evidence) -> str | None:
         remedy = ": allow more sweeps"
     else:
         remedy = (
-            ", and no longer decreasing: use a larger 'tolerance', or mask pixels that receive "
-            "almost no light"
+            ", and no longer decreasing: use a larger 'tolerance', more positions or closer ones, "
+            "or mask pixels that receive almost no light"
         )
     sweeps, error = int(fit.sweeps[-1]), float(fit.error_estimate[-1])
     most, after = e.options.fit.max_sweeps, f"not converged after {sweeps} sweeps"

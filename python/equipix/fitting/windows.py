@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from equipix._check import Array, Bools, Floats, staged
-from equipix._native import Fit
+from equipix._native import Fit, Start
 from equipix.errors import InputError, InsufficientMemoryError
 from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.fitting.error_bars import with_dark_misfit
@@ -32,7 +32,7 @@ _COARSE, _MOST_COARSE = 1e-2, 300
 """Tolerance and most products of the first fits, sufficient in a beam with structure."""
 
 _FINER, _MOST_FINE = 0.3, 100
-"""Tolerance, relative to the remaining noise, and most products of later fits."""
+"""Tolerance, relative to the remaining noise, and most products of fits that start from another."""
 
 _SIGMAS = 6.0
 """Standard deviations √(2/dof) of F that noise does not reach."""
@@ -94,13 +94,14 @@ class WindowFit:
 
     @classmethod
     def of(
-        cls, window: Exposures, options: FitOptions, before: WindowFit | None = None
+        cls,
+        window: Exposures,
+        options: FitOptions,
+        start: Start | None = None,
+        tolerance: float = _COARSE,
     ) -> WindowFit:
-        """Fit beam and sensitivity: coarsely, or finer than the noise that a fit before left."""
-        tolerance, most, start = _COARSE, _MOST_COARSE, None
-        if before is not None:
-            tolerance = max(_FINER * before.noise, np.finfo(float).eps)
-            most, start = _MOST_FINE, before.fit.start()
+        """Fit beam and sensitivity, from another fit on if there is one."""
+        most = _MOST_COARSE if start is None else _MOST_FINE
         progress = staged(options.progress, "sign of shifts")
         stop = FitOptions("multiscale", tolerance, most, options.workers, progress)
         fit = window.fit(stop, start)
@@ -111,6 +112,11 @@ class WindowFit:
         left = fit.misfit / max(freedom, 1)
         share = freedom / max(int(np.count_nonzero(np.isfinite(scaled))), 1)
         return cls(fit, left, freedom, share, float(np.nanmean(squares)), scaled)
+
+    def finer(self, window: Exposures, options: FitOptions) -> WindowFit:
+        """Return a fit whose error is smaller than the noise that this one leaves."""
+        tolerance = max(_FINER * self.noise, np.finfo(float).eps)
+        return WindowFit.of(window, options, self.fit.start(), tolerance)
 
     @cached_property
     def neighbours(self) -> tuple[Correlation, Correlation]:
