@@ -38,6 +38,42 @@ def stripes():
     return mask
 
 
+class TestHeavy:
+    """One exposure with most of the weight: its comparisons are small differences."""
+
+    SHIFTS = np.array([(0, 0), (20, 1), (2, 26), (19, 24), (7, 12)])
+
+    @pytest.mark.long
+    def test_a_fit_that_does_not_end_names_it(self):
+        shape, std = (60, 80), np.array([0.1, 10, 10, 10, 10])
+        truth = simulate.paper_sensitivity(shape, rng=1)
+        beam = simulate.gaussian_beam(shape, width=120, amplitude=1e4)
+        frames = simulate.exposures(truth, beam, self.SHIFTS)
+        frames += np.random.default_rng(0).normal(size=frames.shape) * std[:, None, None]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            cal = equipix.calibrate(frames, self.SHIFTS, variance=std**2, uncertainty=False)
+        (words,) = [each.message for each in cal.findings if each.kind == "convergence"]
+        assert re.search("exposure 0 .* has more than 100 times the weight", words)
+        # What it says to do.
+        std[0] = 1
+        advised = equipix.calibrate(frames, self.SHIFTS, variance=std**2, uncertainty=False)
+        assert advised.converged
+        rms = [(each.sensitivity / (truth / truth.mean())).std() for each in (cal, advised)]
+        assert rms[1] < 1.02 * rms[0]
+
+    @pytest.mark.parametrize(
+        ("variance", "named"),
+        [(None, ""), ([1e-4, 1, 1, 1, 1], "exposure 0"), ([1e-2, 1, 1, 1, 1], "")],
+    )
+    def test_it_is_that_of_a_hundred_times_the_weight_of_the_others(self, variance, named):
+        measured = measured_of(exposures(CROSS), variance and 1e-6 * np.array(variance))
+        flux = Flux.of(None, None, None, 5)
+        words = coverage.too_heavy(Exposures.of(measured, Positions.of(CROSS), flux))
+        assert words.startswith(named)
+        assert bool(words) == bool(named)
+
+
 @pytest.mark.parametrize(
     ("shifts", "options", "cause"),
     [

@@ -37,6 +37,23 @@ fn they_take_a_few_dozen_passes_to_the_truth() {
     }
 }
 
+/// A period along the line of the heavy positions is left to the light ones at all wave vectors across it.
+#[test]
+fn heavy_positions_on_a_line_take_no_more() {
+    let cross = [[0.0, 0.0], [0.0, 11.0], [0.0, 19.0], [11.0, 0.0], [19.0, 0.0]];
+    let whole = Simulation::seeing(even, SENSOR, &cross);
+    let truth = whole.sensitivity();
+    for variances in [[1e-6, 1e-6, 1e-6, 1e-3, 1e-3], [1e-6, 1e-6, 1e-2, 1e-2, 1e-2]] {
+        let noise = Noise::Exposures(variances.to_vec());
+        let answer = fit(&Experiment { noise, ..whole.experiment() }, Options::to(1e-6)).unwrap();
+        let last = answer.history.last().unwrap();
+        assert!(answer.converged && last.passes <= MOST_PASSES, "{}", last.passes);
+        let errors = answer.sensitivity.iter().zip(&truth).map(|(found, m)| (found - m).abs());
+        let largest = errors.fold(0.0, f64::max);
+        assert!(largest <= 2.0 * last.error, "{largest:e} {:e}", last.error);
+    }
+}
+
 #[test]
 fn any_number_of_workers_gives_the_same_bytes() {
     let simulation = Simulation::seeing(even, SENSOR, &FAR).with_noise(1e-3, 2);

@@ -30,10 +30,35 @@ TOO_WEAK = (
 )
 
 
+_HEAVY = 100.0
+"""Weight of an exposure, over that of all others, up to which single precision compares them well.
+"""
+
+
 def why_weak(exposures: Exposures) -> str:
-    """Return why a fit does not come near its minimum: the positions, or else the light."""
+    """Return why a fit does not come near its minimum: positions, weights, or else the light."""
     cause = _uncompared(exposures)
-    return f"the positions do not determine the sensitivity, since {cause}" if cause else TOO_WEAK
+    if cause:
+        return f"the positions do not determine the sensitivity, since {cause}"
+    return too_heavy(exposures) or TOO_WEAK
+
+
+def too_heavy(exposures: Exposures) -> str:
+    """Words on an exposure of so much weight that a fit is less exact; none without one."""
+    if not exposures.knows_noise:
+        return ""
+    weights = np.zeros(len(exposures))
+    for k in range(len(exposures)):
+        relative = np.square(exposures.values[k] / exposures.deviation(k))
+        weights[k] = relative[exposures.usable(k)].mean()
+    k = int(weights.argmax())
+    if not weights[k] > _HEAVY * (weights.sum() - weights[k]):
+        return ""
+    return (
+        f"{exposures.name_of(k)} has more than {_HEAVY:g} times the weight of all others together, "
+        "with which a fit is less exact: give it a variance no smaller than a hundredth of theirs; "
+        "the sensitivity and its noise stay nearly the same"
+    )
 
 
 def left_out(exposures: Exposures, fit: Fit) -> str:

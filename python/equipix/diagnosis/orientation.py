@@ -244,8 +244,10 @@ def _fits(
         odd = np.any([fit.outliers() for fit in fits.values()], axis=0)
         if odd.any():
             windows = {way: window.without(odd) for way, window in windows.items()}
-            starts = {way: fit.fit.start() for way, fit in fits.items()}
-            fits = {way: WindowFit.of(windows[way], options, starts[way]) for way in fits}
+            fits = {
+                way: WindowFit.of(windows[way], options, fit.fit.start())
+                for way, fit in fits.items()
+            }
             continue
         unsettled = [way for way in _undecided(fits) if not fits[way].final]
         if not unsettled:

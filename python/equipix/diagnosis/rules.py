@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from equipix.diagnosis.coverage import left_out, too_far, too_few, why_weak
+from equipix.diagnosis.coverage import left_out, too_far, too_few, too_heavy, why_weak
 from equipix.diagnosis.evidence import Evidence
 from equipix.diagnosis.small_errors import small_errors_found
 from equipix.findings import Rule
@@ -146,9 +146,10 @@ def _on_convergence(e: Evidence) -> str | None:
     elif fit.ended == "sweeps used":
         remedy = ": allow more sweeps"
     else:
-        remedy = (
-            ", and no longer decreasing: use a larger 'tolerance', more positions or closer ones, "
-            "or mask pixels that receive almost no light"
+        remedy = ", and no longer decreasing: " + (
+            too_heavy(e.exposures)
+            or "use a larger 'tolerance', more positions or closer ones, or mask pixels that "
+            "receive almost no light"
         )
     sweeps, error = int(fit.sweeps[-1]), float(fit.error_estimate[-1])
     most, after = e.options.fit.max_sweeps, f"not converged after {sweeps} sweeps"

@@ -32,7 +32,8 @@ _COARSE, _MOST_COARSE = 1e-2, 300
 """Tolerance and most products of the first fits, sufficient in a beam with structure."""
 
 _FINER, _MOST_FINE = 0.3, 100
-"""Tolerance, relative to the remaining noise, and most products of fits that start from another."""
+"""Tolerance of finer fits, relative to the noise that remains, and most products of all that start
+from another."""
 
 _SIGMAS = 6.0
 """Standard deviations √(2/dof) of F that noise does not reach."""
@@ -100,7 +101,7 @@ class WindowFit:
         start: Start | None = None,
         tolerance: float = _COARSE,
     ) -> WindowFit:
-        """Fit beam and sensitivity, from another fit on if there is one."""
+        """Fit beam and sensitivity to such an error of M, from another fit on if there is one."""
         most = _MOST_COARSE if start is None else _MOST_FINE
         progress = staged(options.progress, "sign of shifts")
         stop = FitOptions("multiscale", tolerance, most, options.workers, progress)

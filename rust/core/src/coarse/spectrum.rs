@@ -26,11 +26,8 @@ pub(crate) const MOST_WAVES: usize = 4;
 /// Steps over the wave vectors along an axis, for each pixel that shifts reach, and at least and at most.
 const STEPS_A_PIXEL: usize = 8;
 const STEPS: [usize; 2] = [16, 512];
-/// At such a share of `below` each wave vector delays conjugate gradients, and not the minimum alone.
+/// The share of `below` under which a wave delays conjugate gradients where no hats are around it.
 const NEARLY_ZERO: f64 = 0.05;
-/// Places of the scan, over half of all wave vectors, that the hats around all waves hold: those of one wave,
-/// three times the reach apart, are as many as one in 9 of the pixels that the reach spans.
-const HELD: usize = MOST_WAVES * STEPS_A_PIXEL * STEPS_A_PIXEL / 9 / 2;
 /// How often the steps are halved to come to a minimum: λ is then off by some 1e-7, so that a wave that is not
 /// determined at all is recognised.
 const HALVINGS: usize = 12;
@@ -64,8 +61,8 @@ pub(crate) struct BarelyConstrained {
     pub(crate) share: f64,
     /// A quarter of λ's mean over waves whose phases at the exposures have nothing in common.
     pub(crate) below: f64,
-    /// Whether λ is nearly 0, and not 0, at more wave vectors than the hats around so many waves hold.
-    pub(crate) is_beyond_waves: bool,
+    /// Whether λ is nearly 0 at none besides.
+    pub(crate) are_all: bool,
 }
 
 /// Those of exposures of these shares that reach so many pixels, and hats so far apart: the hats around one
@@ -85,26 +82,27 @@ pub(crate) fn barely_constrained(
         places.into_iter().map(|(_, at)| descend(symbol, shares, at, sizes)).collect();
     found.retain(|&(depth, _)| DETERMINED < depth && depth < DEEPEST);
     found.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let below = (1.0 - shares.iter().map(|share| share * share).sum::<f64>()) / 4.0;
+    let count = scan.depths.iter().filter(|&&depth| depth < below).count();
     let mut waves: Vec<Wave> = Vec::new();
-    for (_, vector) in found {
+    let mut are_all = true;
+    for (depth, vector) in found {
         let is_near = |other: [f64; 2]| {
             (0..2).all(|axis| folded(vector[axis] - other[axis]).abs() * spacing[axis] < PI)
         };
         let is_new = |wave: &Wave| !is_near(wave.vector) && !is_near(wave.vector.map(|q| -q));
-        if waves.len() < MOST_WAVES && !is_near([0.0; 2]) && waves.iter().all(is_new) {
-            let is_alone = is_near(vector.map(|q| -q));
-            let vector = if is_alone { vector.map(|q| PI * (q / PI).round()) } else { vector };
-            waves.push(Wave { vector, is_alone });
+        if is_near([0.0; 2]) || !waves.iter().all(is_new) {
+            continue;
         }
+        if waves.len() == MOST_WAVES {
+            are_all = depth >= NEARLY_ZERO * below;
+            break;
+        }
+        let is_alone = is_near(vector.map(|q| -q));
+        let vector = if is_alone { vector.map(|q| PI * (q / PI).round()) } else { vector };
+        waves.push(Wave { vector, is_alone });
     }
-    let below = (1.0 - shares.iter().map(|share| share * share).sum::<f64>()) / 4.0;
-    let deeper = |limit: f64| scan.depths.iter().filter(|&&depth| depth < limit).count();
-    BarelyConstrained {
-        waves,
-        share: deeper(below) as f64 / scan.depths.len() as f64,
-        below,
-        is_beyond_waves: deeper(NEARLY_ZERO * below) - deeper(DETERMINED) > HELD,
-    }
+    BarelyConstrained { waves, are_all, share: count as f64 / scan.depths.len() as f64, below }
 }
 
 /// A wave vector between −π and π.
@@ -253,19 +251,27 @@ mod tests {
     }
 
     #[test]
-    fn valleys_are_beyond_waves() {
+    fn where_little_weight_determines_many_waves_four_are_not_all() {
         let cross = [[0.0, 0.0], [0.0, 11.0], [0.0, 19.0], [11.0, 0.0], [19.0, 0.0]];
-        // Lattices leave single waves at which λ is 0.
-        let lattice = cross.map(|shift| shift.map(|d| if d == 19.0 { 22.0 } else { d }));
-        let of = |shifts: &[[f64; 2]], heavy: usize, light: f64| {
-            let shares: Vec<f64> = (0..5).map(|k| if k < heavy { 1.0 } else { light }).collect();
-            let total: f64 = shares.iter().sum();
-            let shares: Vec<f64> = shares.iter().map(|share| share / total).collect();
-            barely_constrained(&Shifts(shifts), &shares, [22, 22], [66.0; 2]).is_beyond_waves
+        let of = |shifts: &[[f64; 2]], weights: &[f64]| {
+            let total: f64 = weights.iter().sum();
+            let shares: Vec<f64> = weights.iter().map(|weight| weight / total).collect();
+            let reach = [0, 1].map(|axis| {
+                shifts.iter().map(|shift| shift[axis] as usize).max().unwrap_or_default()
+            });
+            let spacing = reach.map(|reach| (3.0 * reach as f64).max(8.0));
+            barely_constrained(&Shifts(shifts), &shares, reach, spacing).are_all
         };
-        assert!(!of(&cross, 5, 1.0) && !of(&lattice, 5, 1.0));
-        // The first three are on a line.
-        assert!(of(&cross, 3, 1e-2) && of(&cross, 2, 1e-4) && !of(&cross, 4, 1e-4));
+        assert!(of(&cross, &[1.0; 5]));
+        // Heavy ones on a line, and those that leave five waves of a period of 11 columns.
+        assert!(!of(&cross, &[1.0, 1.0, 1.0, 1e-3, 1e-3]));
+        assert!(!of(&cross, &[1.0, 1.0, 1.0, 1e-4, 1e-4]));
+        assert!(!of(&cross, &[1.0, 1.0, 1e-3, 1.0, 1.0]));
+        // Nearly all weight at one place, and one place alone: λ is below what is determined anywhere.
+        for light in [1e-5, 1e-6] {
+            assert!(of(&cross[..2], &[1.0, light]));
+        }
+        assert!(of(&cross[..1], &[1.0]));
     }
 
     #[test]

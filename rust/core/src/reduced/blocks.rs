@@ -19,6 +19,10 @@ const BLOCKS: usize = 3;
 /// Of more waves that are barely constrained the deepest four are too few, and aggregates see them all.
 const MANY: f64 = 150.0;
 
+/// Bytes of aggregates for each pixel above which they take longer than they save: of 8 positions, two of
+/// which had 1e4 times the weight of the others, 450 bytes and twice the time; of 20, 2400 and 14 times.
+const MOST_BYTES: usize = 250;
+
 /// What sees the waves that exposures barely constrain.
 pub(super) enum ShortWaves {
     /// Hats times the deepest of them, as a cell sees them: e^{−iq·d} of the pixel that sees it.
@@ -40,11 +44,14 @@ impl ShortWaves {
         });
         let spacing = hats_of_waves(geometry);
         let spacing = [spacing.rows.spacing, spacing.cols.spacing];
-        let BarelyConstrained { waves, share, below, is_beyond_waves } =
+        let BarelyConstrained { waves, are_all, share, below } =
             barely_constrained(&places, &places.shares, reach, spacing);
         // λ is below t in an ellipse around each minimum, of the share t/(4π √det Σ) where it is deep. Where the
-        // places of most weight are on a line det Σ is nearly 0: there is no ellipse, but a valley.
-        if is_beyond_waves || 4.0 * PI * places.spread() * share / below > MANY {
+        // places of much weight are on a line det Σ is nearly 0, and λ all along lines of wave vectors; what few
+        // of them leave undetermined those of little weight barely determine.
+        let many = 4.0 * PI * places.spread() * share / below > MANY;
+        let is_wanted = many || (places.are_unlike() && !are_all);
+        if is_wanted && bytes_of_aggregates(&places.shares) <= MOST_BYTES {
             return Self::Aggregates;
         }
         let seen = waves.into_iter().map(|wave| {
@@ -68,20 +75,25 @@ impl ShortWaves {
 }
 
 /// What the coarse spaces of these exposures take, in bytes: those of aggregates for each place of the padded
-/// sensor. As measured for five to seven positions, and for five of which one to three are of much weight: the
-/// fewer pairs make aggregates, the smaller these are, and the more edges there are between them.
+/// sensor.
 pub(super) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>, places: u64) -> u64 {
     let short = ShortWaves::of(exposures);
-    let of_aggregates = if let ShortWaves::Aggregates = short {
-        let shares = &Places::of(exposures).shares;
-        let others = |one: usize| shares.iter().skip(one + 1).map(move |other| shares[one] * other);
-        let pairs = || (0..shares.len()).flat_map(others);
-        let strong = pairs().filter(|&pair| pair >= least_strong(shares)).count().max(1);
-        (12 + 4 * shares.len() * pairs().count() / strong) as u64 * places
-    } else {
-        0
+    let of_aggregates = match short {
+        ShortWaves::Aggregates => bytes_of_aggregates(&Places::of(exposures).shares) as u64,
+        ShortWaves::Waves(_) => 0,
     };
-    coarse::bytes_needed(exposures.geometry(), short.waves().len()) + of_aggregates
+    coarse::bytes_needed(exposures.geometry(), short.waves().len()) + of_aggregates * places
+}
+
+/// What aggregates take for each pixel that is seen at places of these shares. As measured for five to seven
+/// positions, and for five of which one to three are of much weight: the fewer pairs make aggregates, the smaller
+/// these are, and the more edges there are between them.
+fn bytes_of_aggregates(shares: &[f64]) -> usize {
+    let others = |one: usize| shares.iter().skip(one + 1).map(move |other| shares[one] * other);
+    let pairs = || (0..shares.len()).flat_map(others);
+    let least = least_strong(shares);
+    let strong = pairs().filter(|&pair| pair >= least).count().max(1);
+    12 + 4 * shares.len() * pairs().count() / strong
 }
 
 fn hats_of_waves(geometry: &Geometry) -> Hats {
@@ -123,7 +135,7 @@ pub(super) fn coarse_spaces<T: Real>(
     Ok((coarse, waves))
 }
 
-/// The exposures at one place: for what they compare they are one.
+/// The places of exposures, with those at each and their share.
 pub(super) struct Places {
     /// Rows and columns.
     pub(super) at: Vec<[usize; 2]>,
@@ -150,6 +162,12 @@ impl Places {
         let share = |alike: &Vec<usize>| alike.iter().map(|&exposure| each[exposure]).sum();
         let shares = exposures.iter().map(share).collect();
         Self { at, exposures, shares }
+    }
+
+    /// Whether one has much less weight than another.
+    fn are_unlike(&self) -> bool {
+        let heaviest = self.shares.iter().copied().fold(0.0, f64::max);
+        self.shares.iter().any(|&share| share < STRONG * heaviest)
     }
 
     /// √det Σ, with Σ the covariance of the shifts.
@@ -181,8 +199,7 @@ fn phase(shift: usize, q: f64) -> Complex {
     [cos, -sin]
 }
 
-/// The least weight of strong pairs of places of these shares: pixels that they compare are nearly alike in what
-/// exposures barely constrain.
+/// The least weight of strong pairs of places of these shares, a quarter of that of the heaviest pair.
 pub(super) fn least_strong(shares: &[f64]) -> f64 {
     let mut falling = shares.to_vec();
     falling.sort_by(|one, other| other.total_cmp(one));
@@ -315,14 +332,17 @@ mod tests {
             assert!(!of(&CROSS, &variances).0, "{variances:?}");
             assert!(of(&FAR, &variances).0, "{variances:?}");
         }
-        // Heavy ones on a line leave valleys.
-        for light in [1e-4, 1e-3, 1e-2] {
-            assert!(of(&CROSS, &[1e-6, 1e-6, light, light, light]).0, "{light}");
-            assert!(of(&CROSS, &[1e-6, 1e-6, 1e-6, light, light]).0, "{light}");
+        // Where heavy ones are on a line.
+        assert!(of(&CROSS, &[1e-6, 1e-6, 1e-2, 1e-2, 1e-2]).0);
+        assert!(of(&CROSS, &[1e-6, 1e-6, 1e-6, 1e-3, 1e-3]).0);
+        // Two of seven have edges to so many others that aggregates take longer.
+        let seven = [&CROSS[..], &[[5.0, 7.0], [13.0, 2.0]]].concat();
+        assert!(!of(&seven, &[1e-6, 1e-6, 1e-2, 1e-2, 1e-2, 1e-2, 1e-2]).0);
+        // Where all are, none of equal weight, whether λ is 0 at places of the scan or beside them.
+        let spaced = [0.0, 17.0, 34.0, 51.0, 68.0].map(|col| [0.0, col]);
+        for line in [FAR.map(|[row, _]| [row, 2.0 * row]), spaced] {
+            assert!(!of(&line, &equal).0);
         }
-        // Where all are on a line, none of equal weight do.
-        let line = FAR.map(|[row, _]| [row, 2.0 * row]);
-        assert!(!of(&line, &equal).0);
     }
 
     #[test]
