@@ -12,6 +12,7 @@
 //! (`penalty.rs`) is slight: τ is 1e-5 of the mean weight of a cell. A product is one pass over the
 //! pixels (`pass.rs`).
 
+mod aggregated;
 mod bands;
 mod conjugate_gradients;
 mod connected;

@@ -54,6 +54,15 @@ impl Gauge {
         self.places.iter().map(move |at| at.map_or(0.0, |at| slope[0] * at[0] + slope[1] * at[1]))
     }
 
+    /// M without the slope of its logarithm, of mean 1: what free fluxes leave of it.
+    pub(crate) fn level(&self) -> Vec<f64> {
+        let logs: Vec<f64> = self.sensitivity.iter().map(|m| m.ln()).collect();
+        let tilts = self.sensitivity.iter().zip(self.plane(self.slope(&logs)));
+        let level: Vec<f64> = tilts.map(|(m, tilt)| m * (-tilt).exp()).collect();
+        let mean = level.iter().sum::<f64>() / level.len() as f64;
+        level.into_iter().map(|m| m / mean).collect()
+    }
+
     /// A change of M, in the gauge.
     pub(crate) fn apply(&self, change: &[f64]) -> Vec<f64> {
         let logs: Vec<f64> = change

@@ -18,6 +18,8 @@ use crate::parallel::Workers;
 const SMOOTHING: f64 = 0.7;
 /// How much is made of what coarser aggregates find.
 const ENLARGED: f64 = 1.8;
+/// The factor of what aggregates find, since the diagonal and the hats see a part of it too.
+const DAMPING: f64 = 0.5;
 /// Aggregates whose matrix is factorised.
 const FEW: usize = 600;
 
@@ -49,11 +51,14 @@ impl Cycle {
         Ok(Self { levels, coarsest: Coarsest::new(&graph) })
     }
 
-    /// The heights y with A y = b, nearly.
-    pub(crate) fn solve(&self, right: &[f64], workers: &Workers) -> Vec<f64> {
-        self.descend(0, right, workers)
+    /// The heights that aggregates add for b, γ A⁻¹ b.
+    pub(crate) fn correct(&self, right: &[f64], workers: &Workers) -> Vec<f64> {
+        let mut heights = self.descend(0, right, workers);
+        heights.iter_mut().for_each(|height| *height *= DAMPING);
+        heights
     }
 
+    /// The heights y with A y = b, nearly, from a level on.
     fn descend(&self, level: usize, right: &[f64], workers: &Workers) -> Vec<f64> {
         let Some((graph, coarser)) = self.levels.get(level) else {
             return self.coarsest.solve(right);
@@ -183,7 +188,7 @@ mod tests {
             };
             // Right-hand sides of errors, without what S does not see.
             let [a, b] = [5, 77].map(|seed| product(&vector(seed)));
-            let (of_a, of_b) = (cycle.solve(&a, &workers), cycle.solve(&b, &workers));
+            let (of_a, of_b) = (cycle.descend(0, &a, &workers), cycle.descend(0, &b, &workers));
             let [ab, ba] = [dot(&a, &of_b), dot(&b, &of_a)];
             // The edges of both directions are the same numbers: rounding in double precision, of a
             // condition of COUNT.
@@ -195,7 +200,7 @@ mod tests {
             let smooth = |at: usize| ((at / SIDE) as f64 / SIDE as f64 * 3.1).cos();
             for error in [vector(9), (0..COUNT).map(smooth).collect()] {
                 let right = product(&error);
-                let found = cycle.solve(&right, &workers);
+                let found = cycle.descend(0, &right, &workers);
                 let quotient = dot(&found, &right) / dot(&error, &right);
                 assert!((0.1..4.3).contains(&quotient), "{quotient}");
             }

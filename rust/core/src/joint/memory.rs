@@ -1,5 +1,6 @@
 //! What the joint fit and its covariance hold in memory.
 
+use super::aggregated;
 use super::bands::Bands;
 use super::layout::{Grid, MARGIN};
 use super::rim::WIDEST;
@@ -19,6 +20,7 @@ use crate::geometry::Rotation;
 /// | a search in double precision: three vectors, and x in single | 28 for each cell |
 /// | … the sums of all bands | 8 for each of their values |
 /// | … the beam and a vector in each view that is turned | 16 for each of its cells |
+/// | … aggregates of cells, where there are any | what `aggregated.rs` says |
 /// | the rim and its factor | some 2000 for each of its cells, [`WIDEST`] of each row and column at most |
 ///
 /// A search in single precision takes less: four vectors and the beam, 20 for each cell, and half of the sums. So
@@ -31,7 +33,9 @@ pub(crate) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>) -> Result<u64>
     let positions = exposures.positions();
     let shifts = positions.on_grid(&positions.shifts);
     let fitted = positions.std.is_some();
-    Ok(bytes_of(&Grid::of(exposures)?, &shifts, fitted, exposures.offset()))
+    let grid = Grid::of(exposures)?;
+    let of_aggregates = aggregated::bytes_needed(exposures, &grid).unwrap_or(0);
+    Ok(bytes_of(&grid, &shifts, fitted, exposures.offset()) + of_aggregates)
 }
 
 fn bytes_of(grid: &Grid, shifts: &[[f64; 2]], fitted: bool, offset: bool) -> u64 {

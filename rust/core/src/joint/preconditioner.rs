@@ -11,6 +11,7 @@
 //! (`joint/wide.rs`). Fluxes and shifts stand beside the hats in the coarse problem: a tilt or a bend of M
 //! that they could explain is distinguished from theirs by large scales alone.
 
+use super::aggregated::{self, Aggregated};
 use super::rim::Rim;
 use super::survey::Block;
 use super::system::{Precision, System};
@@ -20,7 +21,7 @@ use crate::coarse::{Coarse, DAMPING, Entry, Hats, spacing};
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::{Real, Shape};
-use crate::parallel::Value;
+use crate::parallel::{Value, Workers};
 
 /// Blocks of pixels along the distance of two hats.
 const BLOCKS: usize = 3;
@@ -39,7 +40,7 @@ pub(super) const FROM_RIM: [f32; 3] = [0.0, 0.5, 0.7];
 /// Its arrays are in single precision, in units of an ordinary light and weight.
 pub(crate) struct Preconditioner {
     wide: Wide,
-    waves: Waves,
+    short: Short,
     /// 1/D of cells that are not of the rim, less beside it ([`FROM_RIM`]); else 0.
     inverse: Vec<f32>,
     rim: Rim,
@@ -57,6 +58,12 @@ impl Preconditioner {
         let (beam, origin) = (system.pass.grid.geometry.beam, system.pass.grid.geometry.origin);
         let hats = Hats::new(beam, spacing);
         let size = spacing.map(|spacing| (spacing / BLOCKS).max(1));
+        let are_many = aggregated::bytes_needed(system.pass.exposures, &system.pass.grid).is_some();
+        // What a prior holds is no wave.
+        let aggregated = match are_many && system.prior.is_none() {
+            true => Some(Aggregated::new(system, control)?),
+            false => None,
+        };
         let blocks = system.blocks(size, control)?;
         let (sensor, count) = (system.pass.exposures.sensor(), system.pass.exposures.count());
         let params = system.fluxes.columns.len();
@@ -105,7 +112,8 @@ impl Preconditioner {
         let of_prior = prior_of_hats(system, &hats);
         let coarse = Coarse::of_blocks(&hats, &of_prior, &own, entries, control)?;
         control.check()?;
-        let waves = Waves::new(system, &blocks, seen);
+        let short = aggregated
+            .map_or_else(|| Short::Waves(Waves::new(system, &blocks, seen)), Short::Aggregated);
         let rim = Rim::new(system, control)?;
         let invert = |d: f64| if d > 0.0 { 1.0 / d } else { 0.0 };
         let weights = &system.weights;
@@ -116,7 +124,7 @@ impl Preconditioner {
         }
         let params = whole.into_iter().map(invert).collect();
         let (wide, filters) = (Wide::new(hats, system, control), system.pass.grid.is_spline());
-        Ok(Self { wide, waves, inverse, rim, params, coarse, filters })
+        Ok(Self { wide, short, inverse, rim, params, coarse, filters })
     }
 
     /// Whether the coarse matrix has a factor.
@@ -146,7 +154,7 @@ impl Preconditioner {
         heights.extend_from_slice(&of_params);
         self.coarse.correct(&mut heights, DAMPING);
         control.check()?;
-        let lines = self.waves.correct(&self.wide, of_cells, [inward, energy], workers);
+        let of_short = self.short.correct(&self.wide, of_cells, [inward, energy], workers);
         control.check()?;
         let (of_hats, coarse) = heights.split_at_mut(self.wide.hats.count());
         of_hats.iter_mut().for_each(|height| *height *= outward);
@@ -168,7 +176,7 @@ impl Preconditioner {
                 }
             }
             self.wide.spread(of_hats, first, part);
-            self.waves.spread(&self.wide, &lines, first, outward, part);
+            self.short.spread(&self.wide, &of_short, first, outward, part);
         });
         control.check()?;
         self.rim.add(of_cells, z, system.units::<N>(), workers);
@@ -195,10 +203,47 @@ impl Preconditioner {
     #[cfg(test)]
     pub(super) fn waves_of<T: Real>(&self, system: &System<'_, '_, T>, r: &[f64]) -> Vec<f64> {
         let [inward, outward, energy] = self.scales::<f64, T>(system);
-        let lines = self.waves.correct(&self.wide, r, [inward, energy], system.pass.workers);
+        let of_short = self.short.correct(&self.wide, r, [inward, energy], system.pass.workers);
         let mut found = vec![0.0; r.len()];
-        self.waves.spread(&self.wide, &lines, 0, outward, &mut found);
+        self.short.spread(&self.wide, &of_short, 0, outward, &mut found);
         found
+    }
+}
+
+/// What sees the waves that exposures barely constrain.
+enum Short {
+    Waves(Waves),
+    Aggregated(Aggregated),
+}
+
+impl Short {
+    /// The heights of what r has of them, as those wish to spread it.
+    fn correct<N: Value>(
+        &self,
+        wide: &Wide,
+        r: &[N],
+        [inward, energy]: [f64; 2],
+        workers: &Workers,
+    ) -> Vec<f32> {
+        match self {
+            Self::Waves(waves) => waves.correct(wide, r, [inward, energy], workers),
+            Self::Aggregated(aggregated) => aggregated.correct(wide, r, inward, workers),
+        }
+    }
+
+    /// Adds them to rows of cells from `first` on.
+    fn spread<N: Value>(
+        &self,
+        wide: &Wide,
+        heights: &[f32],
+        first: usize,
+        outward: f64,
+        z: &mut [N],
+    ) {
+        match self {
+            Self::Waves(waves) => waves.spread(wide, heights, first, outward, z),
+            Self::Aggregated(aggregated) => aggregated.spread(wide, heights, first, outward, z),
+        }
     }
 }
 

@@ -1,5 +1,6 @@
 //! The rim against dense algebra, and products in single precision against those in double.
 
+use super::aggregated;
 use super::flux::Fluxes;
 use super::layout::Grid;
 use super::preconditioner::{FROM_RIM, Preconditioner, around};
@@ -18,58 +19,76 @@ const ROTATIONS: [Rotation; 4] =
     [Rotation::None, Rotation::Quarter, Rotation::Half, Rotation::ThreeQuarters];
 const FLUX: [f64; 4] = [1.0, 1.1, 0.9, 1.2];
 const SHIFTS: &[[f64; 2]] = testing::SHIFTS.split_at(4).0;
+const BETWEEN: Scan = Scan { sensor: SENSOR, shifts: SHIFTS, rotations: [Rotation::None; 4] };
+/// So far apart that aggregates of cells stand for waves.
+const FAR: Scan = Scan {
+    sensor: Shape::new(43, 61),
+    shifts: &[[0.0, 0.0], [17.0, -24.0], [-19.0, 11.0], [6.0, 31.0]],
+    ..BETWEEN
+};
+
+/// Where a sensor was.
+#[derive(Clone, Copy)]
+struct Scan {
+    sensor: Shape,
+    shifts: &'static [[f64; 2]],
+    rotations: [Rotation; 4],
+}
 
 /// A number from 0 to 1 that looks random.
 fn random(index: usize) -> f64 {
     0.5 + 0.5 * random_number(index)
 }
 
-/// Variances, and what is masked.
-fn uneven() -> (Vec<f64>, Vec<bool>) {
-    let each = 0..ROTATIONS.len() * SENSOR.len();
+/// Variances of a sensor's measurements, and what is masked.
+fn uneven(sensor: Shape) -> (Vec<f64>, Vec<bool>) {
+    let each = 0..ROTATIONS.len() * sensor.len();
     (each.clone().map(|i| 0.5 + random(i)).collect(), each.map(|i| random(i + 999) < 0.1).collect())
 }
 
 /// Calls `visit` with the linear problem of a sensor that is turned every way, and its dense N.
 fn with_turned(visit: impl FnOnce(&System<'_, '_, f64>, &[Vec<f64>])) {
-    let (variance, mask) = uneven();
-    with_system(&ROTATIONS, &each(&variance), &Mask::Measurements(&mask), false, |system| {
+    let (variance, mask) = uneven(SENSOR);
+    let scan = Scan { rotations: ROTATIONS, ..BETWEEN };
+    with_system(&scan, &each(&variance, SENSOR), &Mask::Measurements(&mask), false, |system| {
         visit(system, &dense(system, &FLUX, &variance, &mask));
     });
 }
 
-fn stack(values: &[f64]) -> Stack<'_, f64> {
-    Stack::new("frames", values, ROTATIONS.len(), SENSOR).unwrap()
+fn stack(values: &[f64], sensor: Shape) -> Stack<'_, f64> {
+    Stack::new("frames", values, ROTATIONS.len(), sensor).unwrap()
 }
 
-fn each(variance: &[f64]) -> Variance<'_, f64> {
-    Variance::Measurements(stack(variance))
+fn each(variance: &[f64], sensor: Shape) -> Variance<'_, f64> {
+    Variance::Measurements(stack(variance, sensor))
 }
 
-/// Calls `visit` with the linear problem of exposures that are turned so, which seeks fluxes and shifts too if so
-/// wanted.
+/// Calls `visit` with the linear problem of the exposures of a scan, which seeks fluxes too if so wanted, and shifts
+/// where they are no whole numbers.
 fn with_system(
-    rotations: &[Rotation; 4],
+    &Scan { sensor, shifts, rotations }: &Scan,
     variance: &Variance<'_, f64>,
     mask: &Mask<'_>,
     seeks_more: bool,
     visit: impl FnOnce(&mut System<'_, '_, f64>),
 ) {
     let frames: Vec<f64> =
-        (0..ROTATIONS.len() * SENSOR.len()).map(|i| 1.0 + 0.1 * random(i + 5000)).collect();
+        (0..ROTATIONS.len() * sensor.len()).map(|i| 1.0 + 0.1 * random(i + 5000)).collect();
     let (workers, control) = (Workers::new(None).unwrap(), Control::new());
-    let measurements = Measurements { frames: stack(&frames), variance: *variance, mask: *mask };
-    let std = seeks_more.then(|| vec![[0.02, 0.05]; SHIFTS.len()]);
-    let positions = Positions { shifts: SHIFTS.to_vec(), rotations: rotations.to_vec(), std };
+    let frames = stack(&frames, sensor);
+    let measurements = Measurements { frames, variance: *variance, mask: *mask };
+    let is_between = shifts.as_flattened().iter().any(|shift| shift.fract() != 0.0);
+    let std = (seeks_more && is_between).then(|| vec![[0.02, 0.05]; shifts.len()]);
+    let positions = Positions { shifts: shifts.to_vec(), rotations: rotations.to_vec(), std };
     let prior = ShiftPrior::of(&positions);
     let kind = if seeks_more { FluxKind::Free } else { FluxKind::Known };
     let lamp = Flux { values: FLUX.to_vec(), kind: kind.clone() };
     let exposures =
         Exposures::new(measurements, positions, lamp, false, &workers, &control).unwrap();
-    let grid = Grid::new(SENSOR, SHIFTS, rotations, seeks_more).unwrap();
-    let fluxes = Fluxes::new(&FLUX, &kind, SHIFTS, rotations);
+    let grid = Grid::of(&exposures).unwrap();
+    let fluxes = Fluxes::new(&FLUX, &kind, shifts, &rotations);
     let beam = (0..grid.geometry.beam.len()).map(|cell| 1.0 + 0.1 * random(cell + 300)).collect();
-    let state = State { beam, theta: vec![0.0; fluxes.columns.len()], shifts: SHIFTS.to_vec() };
+    let state = State { beam, theta: vec![0.0; fluxes.columns.len()], shifts: shifts.to_vec() };
     let mut system = System::new(&exposures, grid, fluxes, state, &workers, &control).unwrap();
     system.seek_shifts(prior);
     system.linearise(&control).unwrap();
@@ -190,15 +209,18 @@ fn less_is_left_beside_the_rim() {
 
 #[test]
 fn the_preconditioner_is_symmetric_and_the_same_in_single_precision() {
-    let (variance, mask) = uneven();
-    for seeks_more in [false, true] {
-        is_symmetric_and_the_same(&variance, &mask, seeks_more);
+    for (scan, seeks_more) in [(BETWEEN, false), (BETWEEN, true), (FAR, false), (FAR, true)] {
+        is_symmetric_and_the_same(&scan, seeks_more);
     }
 }
 
-fn is_symmetric_and_the_same(variance: &[f64], mask: &[bool], seeks_more: bool) {
-    let (variance, mask) = (each(variance), Mask::Measurements(mask));
-    with_system(&[Rotation::None; 4], &variance, &mask, seeks_more, |system| {
+fn is_symmetric_and_the_same(scan: &Scan, seeks_more: bool) {
+    let (variance, mask) = uneven(scan.sensor);
+    let (variance, mask) = (each(&variance, scan.sensor), Mask::Measurements(&mask));
+    with_system(scan, &variance, &mask, seeks_more, |system| {
+        let grid = &system.pass.grid;
+        let are_many = aggregated::bytes_needed(system.pass.exposures, grid).is_some();
+        assert_eq!(are_many, !grid.is_spline());
         let control = Control::new();
         let preconditioner = Preconditioner::new(system, &control).unwrap();
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
@@ -272,13 +294,13 @@ fn the_matrix_of_waves_is_that_of_the_product() {
 
 #[test]
 fn a_product_in_single_precision_is_that_in_double() {
-    let (variance, mask) = uneven();
+    let (variance, mask) = uneven(SENSOR);
     let even = (Variance::Exposures(&[1.0, 2.0, 0.5, 3.0]), Mask::None);
-    let cases = [(each(&variance), Mask::Measurements(&mask)), even];
+    let cases = [(each(&variance, SENSOR), Mask::Measurements(&mask)), even];
     for ((variance, mask), seeks_more) in
         cases.iter().flat_map(|case| [(case, false), (case, true)])
     {
-        with_system(&[Rotation::None; 4], variance, mask, seeks_more, |system| {
+        with_system(&BETWEEN, variance, mask, seeks_more, |system| {
             assert!(system.has_single());
             let control = Control::new();
             let x: Vec<f64> = (0..system.size()).map(|cell| random(cell + 31) - 0.5).collect();

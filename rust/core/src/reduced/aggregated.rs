@@ -11,9 +11,6 @@ use crate::frames::Real;
 use crate::padded::Padding;
 use crate::parallel::Workers;
 
-/// The factor of what aggregates find, since the diagonal and the hats see a part of it too.
-const DAMPING: f64 = 0.5;
-
 /// Aggregates of pixels.
 pub(super) struct Aggregated {
     padding: Padding,
@@ -44,9 +41,9 @@ impl Aggregated {
     ) -> (f64, Vec<f32>) {
         let of = |pixel: usize| f64::from(residual[pixel] * sensitivity[pixel]);
         let right = self.pixels.sums(of, workers);
-        let heights = self.cycle.solve(&right, workers);
-        let product = right.iter().zip(&heights).map(|(b, y)| DAMPING * b * y).sum();
-        (product, heights.into_iter().map(|y| (DAMPING * y) as f32).collect())
+        let heights = self.cycle.correct(&right, workers);
+        let product = right.iter().zip(&heights).map(|(b, y)| b * y).sum();
+        (product, heights.into_iter().map(|y| y as f32).collect())
     }
 
     /// Heights at rows of pixels from `first` on.

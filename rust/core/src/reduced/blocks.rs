@@ -24,15 +24,16 @@ const MANY: f64 = 150.0;
 const MOST_BYTES: usize = 250;
 
 /// What sees the waves that exposures barely constrain.
-pub(super) enum ShortWaves {
+pub(crate) enum ShortWaves {
     /// Hats times the deepest of them, as a cell sees them: e^{−iq·d} of the pixel that sees it.
     Waves(Vec<SeenWave>),
-    Aggregates,
+    /// Of so many bytes for each place of the padded sensor.
+    Aggregates { bytes: usize },
 }
 
 impl ShortWaves {
     /// That of these exposures. Where they are turned against each other no wave is seen as one.
-    pub(super) fn of<T: Real>(exposures: &Exposures<'_, T>) -> Self {
+    pub(crate) fn of<T: Real>(exposures: &Exposures<'_, T>) -> Self {
         let geometry = exposures.geometry();
         if geometry.views.len() > 1 {
             return Self::Waves(Vec::new());
@@ -51,8 +52,9 @@ impl ShortWaves {
         // of them leave undetermined those of little weight barely determine.
         let many = 4.0 * PI * places.spread() * share / below > MANY;
         let is_wanted = many || (places.are_unlike() && !are_all);
-        if is_wanted && bytes_of_aggregates(&places.shares) <= MOST_BYTES {
-            return Self::Aggregates;
+        let bytes = bytes_of_aggregates(&places.shares);
+        if is_wanted && bytes <= MOST_BYTES {
+            return Self::Aggregates { bytes };
         }
         let seen = waves.into_iter().map(|wave| {
             let [q, p] = wave.vector;
@@ -69,7 +71,7 @@ impl ShortWaves {
     fn waves(&self) -> &[SeenWave] {
         match self {
             Self::Waves(waves) => waves,
-            Self::Aggregates => &[],
+            Self::Aggregates { .. } => &[],
         }
     }
 }
@@ -79,10 +81,10 @@ impl ShortWaves {
 pub(super) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>, places: u64) -> u64 {
     let short = ShortWaves::of(exposures);
     let of_aggregates = match short {
-        ShortWaves::Aggregates => bytes_of_aggregates(&Places::of(exposures).shares) as u64,
+        ShortWaves::Aggregates { bytes } => bytes as u64 * places,
         ShortWaves::Waves(_) => 0,
     };
-    coarse::bytes_needed(exposures.geometry(), short.waves().len()) + of_aggregates * places
+    coarse::bytes_needed(exposures.geometry(), short.waves().len()) + of_aggregates
 }
 
 /// What aggregates take for each pixel that is seen at places of these shares. As measured for five to seven
@@ -136,17 +138,17 @@ pub(super) fn coarse_spaces<T: Real>(
 }
 
 /// The places of exposures, with those at each and their share.
-pub(super) struct Places {
+pub(crate) struct Places {
     /// Rows and columns.
-    pub(super) at: Vec<[usize; 2]>,
+    pub(crate) at: Vec<[usize; 2]>,
     /// The exposures at each, in their order.
-    pub(super) exposures: Vec<Vec<usize>>,
+    pub(crate) exposures: Vec<Vec<usize>>,
     /// Their share of all weight.
-    pub(super) shares: Vec<f64>,
+    pub(crate) shares: Vec<f64>,
 }
 
 impl Places {
-    pub(super) fn of<T: Real>(all: &Exposures<'_, T>) -> Self {
+    pub(crate) fn of<T: Real>(all: &Exposures<'_, T>) -> Self {
         let (mut at, mut exposures): (Vec<_>, Vec<Vec<usize>>) = (Vec::new(), Vec::new());
         for (exposure, place) in all.geometry().placements.iter().enumerate() {
             let place = [place.row, place.col];
@@ -200,7 +202,7 @@ fn phase(shift: usize, q: f64) -> Complex {
 }
 
 /// The least weight of strong pairs of places of these shares, a quarter of that of the heaviest pair.
-pub(super) fn least_strong(shares: &[f64]) -> f64 {
+pub(crate) fn least_strong(shares: &[f64]) -> f64 {
     let mut falling = shares.to_vec();
     falling.sort_by(|one, other| other.total_cmp(one));
     STRONG * falling.iter().take(2).product::<f64>()
@@ -320,7 +322,7 @@ mod tests {
         let positions = Positions::of_shifts(shifts);
         let exposures =
             Exposures::new(measurements, positions, flux, false, &workers, &control).unwrap();
-        let is_many = matches!(ShortWaves::of(&exposures), ShortWaves::Aggregates);
+        let is_many = matches!(ShortWaves::of(&exposures), ShortWaves::Aggregates { .. });
         (is_many, bytes_needed(&exposures, 30_000))
     }
 

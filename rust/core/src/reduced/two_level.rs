@@ -91,7 +91,7 @@ impl<'m> TwoLevel<'m> {
         if self.coarse.is_none() {
             let Self { hats, short, workers, .. } = self;
             let (coarse, waves) = coarse_spaces(hats, short, reduced, workers, control)?;
-            if let ShortWaves::Aggregates = short {
+            if let ShortWaves::Aggregates { .. } = short {
                 self.aggregated = Some(Aggregated::new(reduced, workers, control)?);
             }
             self.waves = Some(waves).filter(|waves| !waves.is_empty());
