@@ -8,7 +8,8 @@
 //! axis, by the factors 1/6, 4/6, 1/6. K is a filter that is near to their inverse, so that D weighs
 //! values. χ is 1 but at the rim of the beam, where R takes over (`joint/rim.rs`). The third part is that of
 //! [`coarse`](crate::coarse), with the columns of Φ hats times the beam
-//! (`joint/wide.rs`). Fluxes and shifts stand beside the hats in the coarse problem: a tilt or a bend of M
+//! (`joint/wide.rs`). Hats times waves stand beside them (`joint/waves.rs`), or aggregates of cells where waves are
+//! many (`joint/aggregated.rs`). Fluxes and shifts stand beside the hats in the coarse problem: a tilt or a bend of M
 //! that they could explain is distinguished from theirs by large scales alone.
 
 use super::aggregated::{self, Aggregated};
