@@ -19,16 +19,16 @@ mod matrix;
 mod modulated;
 mod modulated_kernel;
 mod modulated_matrix;
+mod short_waves;
 mod spacing;
 mod spectrum;
 
 pub(crate) use cycle::Cycle;
-pub(crate) use graph::{Edges, Graph, NONE, Partition, STRONG};
+pub(crate) use graph::{Edges, Graph, NONE, Partition};
 pub(crate) use hats::Hats;
 pub(crate) use matrix::{Coarse, Entry};
 pub(crate) use modulated::Modulated;
 pub(crate) use modulated_matrix::{SeenWave, Spot};
+pub(crate) use short_waves::{Places, ShortWaves, pairs};
 pub(crate) use spacing::{DAMPING, bytes_needed, spacing, spacing_of_waves};
-pub(crate) use spectrum::{
-    BarelyConstrained, Complex, MOST_WAVES, Symbol, barely_constrained, times,
-};
+pub(crate) use spectrum::{Complex, MOST_WAVES, Symbol, barely_constrained, times};

@@ -29,7 +29,6 @@ mod two_level;
 mod two_level_kernel;
 mod weak_light;
 
-pub(crate) use blocks::{Places, ShortWaves, least_strong};
 pub(crate) use conjugate_gradients::{ConjugateGradients, Smallest, bytes_needed};
 pub(crate) use operator::{Draw, Reduced, Scale};
 pub(crate) use two_level::TwoLevel;

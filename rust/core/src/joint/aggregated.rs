@@ -1,19 +1,25 @@
 //! The aggregates of cells of a beam that is no spline, with their matrix: in place of waves, where these are many.
 //!
 //! With the pixels eliminated, the cells that a pixel sees are compared with each other as the pixels that see a
-//! cell are with the cells eliminated (`reduced/aggregated.rs`): with the weight Ω_k Ω_l / Σ Ω, Ω = w c² L² M².
+//! cell are with the cells eliminated (`reduced/aggregated.rs`):
+//!
+//! ```text
+//! yᵀΦᵀSΦy = Σ_p [ Σ_{k<l} Ω_k Ω_l (y_k − y_l)² + Λ Σ_k Ω_k y_k² ] / (Λ + Σ Ω),   Ω = w c² L² M²,  Λ = λ M²
+//! ```
+//!
+//! with the weight λ of a prior of M. An offset that is sought takes some more out of S; as the hats, aggregates do
+//! not count that.
 
 use super::layout::Grid;
 use super::system::System;
 use super::wide::Wide;
-use crate::coarse::{Cycle, Edges, NONE, Partition};
+use crate::coarse::{Cycle, Edges, NONE, Partition, Places, ShortWaves, pairs};
 use crate::control::Control;
 use crate::error::Result;
 use crate::exposures::Exposures;
 use crate::frames::{Real, Shape};
 use crate::geometry::Rotation;
 use crate::parallel::{Value, Workers};
-use crate::reduced::{Places, ShortWaves, least_strong};
 
 /// Rows of pixels that a thread weighs at a time.
 const BAND: usize = 32;
@@ -26,21 +32,27 @@ pub(super) struct Aggregated {
 }
 
 impl Aggregated {
-    /// Those at the state of a system.
+    /// Those at the state of a system, where they stand for its waves.
     ///
     /// # Errors
     /// [`Error::Cancelled`](crate::Error::Cancelled).
-    pub(super) fn new<T: Real>(system: &mut System<'_, '_, T>, control: &Control) -> Result<Self> {
+    pub(super) fn where_waves_are_many<T: Real>(
+        system: &mut System<'_, '_, T>,
+        control: &Control,
+    ) -> Result<Option<Self>> {
+        if bytes_needed(system.pass.exposures, &system.pass.grid).is_none() {
+            return Ok(None);
+        }
         let workers = system.pass.workers;
         let seen = Seen::new(system, control)?;
         let cells = seen.partition(system.weights.len(), workers, control)?;
         let graph = cells.graph(&seen, workers, control)?;
         drop(seen);
         let cols = system.pass.grid.geometry.beam.cols;
-        Ok(Self { cells, cycle: Cycle::new(graph, workers, control)?, cols })
+        Ok(Some(Self { cells, cycle: Cycle::new(graph, workers, control)?, cols }))
     }
 
-    /// The heights that Φᵀ r has; `inward` brings r into the units of the matrix.
+    /// A share of A⁻¹ Φᵀ r, nearly; `inward` brings r into the units of A.
     pub(super) fn correct<N: Value>(
         &self,
         wide: &Wide,
@@ -72,29 +84,26 @@ impl Aggregated {
     }
 }
 
-/// What aggregates take in bytes where they stand for the waves of these exposures, with the weights that their
-/// matrix is summed from: `None` where waves are fewer, or the beam is a spline.
+/// What aggregates take in bytes where they stand for the waves of these exposures, with what their matrix is summed
+/// from: `None` where waves are fewer as the fluxes were given, where the beam is a spline, or its views are turned.
 pub(super) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>, grid: &Grid) -> Option<u64> {
     let is_turned = grid.geometry.views.iter().any(|view| view.rotation != Rotation::None);
-    match ShortWaves::of(exposures) {
-        ShortWaves::Aggregates { bytes } if !(is_turned || grid.is_spline()) => {
-            let of_weights = size_of::<f32>() * exposures.count() * grid.sensor.len();
-            Some((bytes * grid.geometry.beam.len() + of_weights) as u64)
-        }
-        _ => None,
+    if is_turned || grid.is_spline() {
+        return None;
     }
+    let ShortWaves::Aggregates { bytes, places } = ShortWaves::of(exposures) else { return None };
+    let of_pixel = size_of::<f32>() * (places + 1);
+    Some((bytes * grid.geometry.beam.len() + of_pixel * grid.sensor.len()) as u64)
 }
 
-/// What pixels see of the cells.
+/// Cells, compared by the pixels that see them.
 struct Seen {
     sensor: Shape,
     cols: usize,
     /// The cell that the first pixel sees from each place.
     places: Vec<[usize; 2]>,
-    /// Pairs of places, in either order, with the weight of what they compare: strong ones alone make aggregates, as
-    /// in `reduced/aggregated.rs`.
     strong: Vec<([usize; 2], f32)>,
-    /// Ω in units of an ordinary one: of each place the pixels of a row, row by row.
+    /// Ω in units of an ordinary one: of each place the pixels of a row, then their Λ, row by row.
     weights: Vec<f32>,
 }
 
@@ -102,23 +111,26 @@ impl Seen {
     fn new<T: Real>(system: &mut System<'_, '_, T>, control: &Control) -> Result<Self> {
         system.pass.count += 1;
         let pass = &system.pass;
-        let Places { exposures, shares, .. } = Places::of(pass.exposures);
+        let Places { exposures, .. } = Places::of(pass.exposures);
         let sensor = pass.exposures.sensor();
         let [light, weight] = system.ordinary;
         let unit = weight * light * light;
         let beams = pass.views_of(&system.state.beam);
-        let width = exposures.len() * sensor.cols;
+        let width = (exposures.len() + 1) * sensor.cols;
         let mut weights = pass.workers.filled(sensor.rows * width, 0.0_f32, control);
-        pass.workers.map_blocks(&mut weights, BAND * width, |band, rows| {
+        let sums = pass.workers.map_blocks(&mut weights, BAND * width, |band, rows| {
             let mut workspace = pass.workspace();
+            let mut sums = vec![0.0; exposures.len()];
             for (index, found) in rows.chunks_exact_mut(width).enumerate() {
                 if control.is_cancelled() {
-                    return;
+                    break;
                 }
                 let row = band * BAND + index;
                 pass.weigh_row(row, &mut workspace.weights);
                 pass.see_beam(&beams, row, &mut workspace);
-                for (found, alike) in found.chunks_exact_mut(sensor.cols).zip(&exposures) {
+                let (found, of_prior) = found.split_at_mut(width - sensor.cols);
+                let alike = found.chunks_exact_mut(sensor.cols).zip(&exposures).zip(&mut sums);
+                for ((found, alike), sum) in alike {
                     for (col, (found, m)) in found.iter_mut().zip(pass.row(row)).enumerate() {
                         let of = |&k: &usize| {
                             let at = k * sensor.cols + col;
@@ -126,19 +138,24 @@ impl Seen {
                         };
                         *found = (alike.iter().map(of).sum::<f64>() / unit) as f32;
                     }
-                    pass.few.in_row(row).iter().for_each(|&col| found[col] = 0.0);
+                    pass.few.clear(row, found);
+                    *sum += found.iter().map(|&weight| f64::from(weight)).sum::<f64>();
+                }
+                if let Some(prior) = &system.prior {
+                    let own = prior.weights[row * sensor.cols..].iter().zip(pass.row(row));
+                    for (found, (weight, m)) in of_prior.iter_mut().zip(own) {
+                        *found = (weight * m * m / unit) as f32;
+                    }
                 }
             }
+            sums
         });
         control.check()?;
-        let least = least_strong(&shares);
-        let each = 0..shares.len();
-        let pairs = each.clone().flat_map(|one| each.clone().map(move |other| [one, other]));
-        let strong = pairs
-            .filter(|[one, other]| one != other)
-            .map(|[one, other]| ([one, other], shares[one] * shares[other]))
-            .filter(|&(_, weight)| weight >= least)
-            .map(|(pair, weight)| (pair, weight as f32));
+        // Fluxes that are sought may be far from those that were given.
+        let share = |place: usize| sums.iter().map(|sums| sums[place]).sum();
+        let shares: Vec<f64> = (0..exposures.len()).map(share).collect();
+        let strong = pairs(&shares).into_iter().filter(|pair| pair.is_strong);
+        let strong = strong.map(|pair| (pair.places, pair.weight as f32));
         // The exposures of a place see the same cells.
         let at = |alike: &Vec<usize>| [pass.windows[alike[0]].row, pass.windows[alike[0]].col];
         Ok(Self {
@@ -152,18 +169,18 @@ impl Seen {
 
     fn partition(&self, cells: usize, workers: &Workers, control: &Control) -> Result<Partition> {
         let beside = |cell: usize| {
-            let seen = self.strong.iter().filter_map(move |&([one, other], weight)| {
+            self.strong.iter().filter_map(move |&([one, other], weight)| {
                 let pixel = self.pixel(cell, one)?;
-                let is_seen = self.weight(pixel, one) > 0.0 && self.weight(pixel, other) > 0.0;
-                is_seen.then(|| (self.cell(pixel, other), weight))
-            });
-            seen
+                self.compares(pixel, one, other).then(|| (self.cell(pixel, other), weight))
+            })
         };
         // The diagonal does those that are compared with nothing.
         let is_used = |cell: usize| {
-            let mut is_compared = false;
-            self.of(cell, |_, _| is_compared = true);
-            is_compared
+            (0..self.places.len()).any(|place| {
+                let pixel = self.pixel(cell, place);
+                let mut others = (0..self.places.len()).filter(|&other| other != place);
+                pixel.is_some_and(|pixel| others.any(|other| self.compares(pixel, place, other)))
+            })
         };
         Partition::neighbourhoods(cells, is_used, beside, workers, control)
     }
@@ -181,9 +198,20 @@ impl Seen {
         (row + at[0]) * self.cols + col + at[1]
     }
 
+    /// Ω of a place, or Λ behind the last.
     fn weight(&self, [row, col]: [usize; 2], place: usize) -> f64 {
-        let line = row * self.places.len() + place;
+        let line = row * (self.places.len() + 1) + place;
         f64::from(self.weights[line * self.sensor.cols + col])
+    }
+
+    /// Λ + Σ Ω.
+    fn total(&self, pixel: [usize; 2]) -> f64 {
+        (0..=self.places.len()).map(|place| self.weight(pixel, place)).sum()
+    }
+
+    /// Whether a pixel measured from both places.
+    fn compares(&self, pixel: [usize; 2], one: usize, other: usize) -> bool {
+        self.weight(pixel, one) > 0.0 && self.weight(pixel, other) > 0.0
     }
 }
 
@@ -195,7 +223,7 @@ impl Edges for Seen {
             if own == 0.0 {
                 continue;
             }
-            let total: f64 = (0..self.places.len()).map(|place| self.weight(pixel, place)).sum();
+            let total = self.total(pixel);
             for other in (0..self.places.len()).filter(|&other| other != place) {
                 // The same number from either end.
                 let weight = own * self.weight(pixel, other) / total;
@@ -206,8 +234,13 @@ impl Edges for Seen {
         }
     }
 
-    fn own(&self, _: usize) -> f64 {
-        0.0
+    fn own(&self, cell: usize) -> f64 {
+        let of_place = |place: usize| {
+            let pixel = self.pixel(cell, place)?;
+            let of_prior = self.weight(pixel, self.places.len());
+            (of_prior > 0.0).then(|| self.weight(pixel, place) * of_prior / self.total(pixel))
+        };
+        (0..self.places.len()).filter_map(of_place).sum()
     }
 }
 
@@ -216,7 +249,7 @@ mod tests {
     use super::*;
     use crate::exposures::{Flux, FluxKind, Mask, Measurements, Positions, Variance};
     use crate::frames::Stack;
-    use crate::joint::{Fluxes, State};
+    use crate::joint::{Fluxes, Prior, State};
     use crate::testing::random_number;
 
     const SENSOR: Shape = Shape::new(23, 31);
@@ -237,10 +270,14 @@ mod tests {
         let masked: Vec<bool> = (0..count).map(|at| random_number(at + 5) > 0.8).collect();
         let stack = |values| Stack::new("frames", values, SHIFTS.len(), SENSOR).unwrap();
         let whole = Variance::Exposures(&[4e-6, 9e-5, 5e-7, 1e-6, 2e-4]);
-        for (variance, mask) in [
-            (Variance::Unknown, Mask::None),
-            (whole, Mask::Measurements(&masked)),
-            (Variance::Measurements(stack(&variance)), Mask::Measurements(&masked)),
+        let held = (0..SENSOR.len()).map(|pixel| if pixel % 5 == 0 { 300.0 } else { 0.0 });
+        let prior = Prior { weights: held.collect(), mean: 1.0 };
+        let uneven = Variance::Measurements(stack(&variance));
+        for (variance, mask, prior) in [
+            (Variance::Unknown, Mask::None, None),
+            (whole, Mask::Measurements(&masked), None),
+            (uneven, Mask::Measurements(&masked), None),
+            (uneven, Mask::Measurements(&masked), Some(prior)),
         ] {
             let measurements = Measurements { frames: stack(&frames), variance, mask };
             let flux = vec![1.0, 0.7, 1.6, 0.4, 1.2];
@@ -254,6 +291,8 @@ mod tests {
             let state = State { beam, theta: Vec::new(), shifts: SHIFTS.to_vec() };
             let mut system =
                 System::new(&exposures, grid, fluxes, state, &workers, &control).unwrap();
+            assert_eq!(system.pass.few.pixels > 0, matches!(mask, Mask::Measurements(_)));
+            system.prior = prior;
             system.linearise(&control).unwrap();
             let seen = Seen::new(&mut system, &control).unwrap();
             let cells = seen.partition(system.weights.len(), &workers, &control).unwrap();
@@ -267,11 +306,36 @@ mod tests {
             let mut product = Vec::new();
             system.multiply(&x, &mut product, 0.0, &control).unwrap();
             let [light, weight] = system.ordinary;
-            let wanted = workers.dot(&x, &product) / (weight * light * light);
+            let of = |cell: usize| product[cell] * system.state.beam[cell];
             let left = matrix.residual(&vec![0.0; heights.len()], &heights, &workers);
-            let found: f64 = left.iter().zip(&heights).map(|(left, y)| -left * y).sum();
-            // Ω in single precision.
-            assert!((found / wanted - 1.0).abs() < 1e-6, "{found} {wanted}");
+            let scale = left.iter().fold(0.0, |most: f64, left| most.max(left.abs()));
+            // Where a prior holds M, products leave out what pulls at the multiple of the beam.
+            let multiple = -left.iter().sum::<f64>() / light;
+            let beam_of = |cell: usize| system.state.beam[cell] * f64::from(system.scale[cell]);
+            let beams = cells.sums(beam_of, &workers);
+            for ((left, wanted), beam) in left.iter().zip(cells.sums(of, &workers)).zip(beams) {
+                let (found, wanted) = (-left - multiple * beam, wanted / (weight * light * light));
+                // Ω in single precision.
+                assert!((found - wanted).abs() < 1e-6 * scale, "{found} {wanted}");
+            }
+        }
+    }
+
+    /// Two heavy places compare along one line, and a light one makes no aggregates with them.
+    #[test]
+    fn an_aggregate_reaches_over_strong_comparisons_alone() {
+        let (workers, control) = (Workers::new(None).unwrap(), Control::new());
+        let places = vec![[0, 0], [0, 2], [0, 1]];
+        let sensor = Shape::new(1, 9);
+        let weights = [[1.0; 9], [1.0; 9], [1e-3; 9], [0.0; 9]].concat();
+        let strong = pairs(&[1.0, 1.0, 1e-3]).into_iter().filter(|pair| pair.is_strong);
+        let strong = strong.map(|pair| (pair.places, pair.weight as f32)).collect();
+        let seen = Seen { sensor, cols: 11, places, strong, weights };
+        let cells = seen.partition(11, &workers, &control).unwrap();
+        for (cell, aggregate) in cells.of.iter().enumerate() {
+            assert!(*aggregate != NONE);
+            let alike = cells.of.iter().enumerate().filter(|(_, other)| *other == aggregate);
+            assert!(alike.into_iter().all(|(other, _)| other % 2 == cell % 2), "{:?}", cells.of);
         }
     }
 }

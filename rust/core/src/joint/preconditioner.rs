@@ -12,7 +12,7 @@
 //! many (`joint/aggregated.rs`). Fluxes and shifts stand beside the hats in the coarse problem: a tilt or a bend of M
 //! that they could explain is distinguished from theirs by large scales alone.
 
-use super::aggregated::{self, Aggregated};
+use super::aggregated::Aggregated;
 use super::rim::Rim;
 use super::survey::Block;
 use super::system::{Precision, System};
@@ -41,7 +41,7 @@ pub(super) const FROM_RIM: [f32; 3] = [0.0, 0.5, 0.7];
 /// Its arrays are in single precision, in units of an ordinary light and weight.
 pub(crate) struct Preconditioner {
     wide: Wide,
-    short: Short,
+    short: ShortScale,
     /// 1/D of cells that are not of the rim, less beside it ([`FROM_RIM`]); else 0.
     inverse: Vec<f32>,
     rim: Rim,
@@ -59,12 +59,7 @@ impl Preconditioner {
         let (beam, origin) = (system.pass.grid.geometry.beam, system.pass.grid.geometry.origin);
         let hats = Hats::new(beam, spacing);
         let size = spacing.map(|spacing| (spacing / BLOCKS).max(1));
-        let are_many = aggregated::bytes_needed(system.pass.exposures, &system.pass.grid).is_some();
-        // What a prior holds is no wave.
-        let aggregated = match are_many && system.prior.is_none() {
-            true => Some(Aggregated::new(system, control)?),
-            false => None,
-        };
+        let aggregated = Aggregated::where_waves_are_many(system, control)?;
         let blocks = system.blocks(size, control)?;
         let (sensor, count) = (system.pass.exposures.sensor(), system.pass.exposures.count());
         let params = system.fluxes.columns.len();
@@ -113,8 +108,8 @@ impl Preconditioner {
         let of_prior = prior_of_hats(system, &hats);
         let coarse = Coarse::of_blocks(&hats, &of_prior, &own, entries, control)?;
         control.check()?;
-        let short = aggregated
-            .map_or_else(|| Short::Waves(Waves::new(system, &blocks, seen)), Short::Aggregated);
+        let waves = || ShortScale::Waves(Waves::new(system, &blocks, seen));
+        let short = aggregated.map_or_else(waves, ShortScale::Aggregated);
         let rim = Rim::new(system, control)?;
         let invert = |d: f64| if d > 0.0 { 1.0 / d } else { 0.0 };
         let weights = &system.weights;
@@ -212,13 +207,13 @@ impl Preconditioner {
 }
 
 /// What sees the waves that exposures barely constrain.
-enum Short {
+enum ShortScale {
     Waves(Waves),
     Aggregated(Aggregated),
 }
 
-impl Short {
-    /// The heights of what r has of them, as those wish to spread it.
+impl ShortScale {
+    /// The heights that r makes of them, or what waves have of those at every column.
     fn correct<N: Value>(
         &self,
         wide: &Wide,

@@ -3,6 +3,7 @@
 use super::aggregated;
 use super::flux::Fluxes;
 use super::layout::Grid;
+use super::memory::bytes_needed;
 use super::preconditioner::{FROM_RIM, Preconditioner, around};
 use super::rim::{NEAR_OF_TURNED as NEAR, Rim};
 use super::system::System;
@@ -255,6 +256,25 @@ fn is_symmetric_and_the_same(scan: &Scan, seeks_more: bool) {
             assert!((one - z).abs() < rounding * z.abs().max(size.sqrt()), "{one} {z}");
         }
     });
+}
+
+#[test]
+fn aggregates_are_counted_and_none_are_of_turned_exposures() {
+    let of = |rotation| {
+        let mut found = (0, None, 0);
+        let scan = Scan { rotations: [rotation; 4], ..FAR };
+        with_system(&scan, &Variance::Unknown, &Mask::None, false, |system| {
+            let (exposures, grid) = (system.pass.exposures, &system.pass.grid);
+            let of_aggregates = aggregated::bytes_needed(exposures, grid);
+            let of_view = 16 * grid.geometry.beam.len() as u64;
+            found = (bytes_needed(exposures).unwrap(), of_aggregates, of_view);
+        });
+        found
+    };
+    let (all, of_aggregates, _) = of(Rotation::None);
+    let (turned, none, of_view) = of(Rotation::Half);
+    assert!(none.is_none());
+    assert_eq!(all, turned - of_view + of_aggregates.unwrap());
 }
 
 /// Of pixels that see waves of period 7 nearly alike, S and the matrix of hats times those waves agree.

@@ -2,9 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use super::blocks::{Places, least_strong};
 use super::operator::{Input, Reduced};
-use crate::coarse::{Cycle, Edges, Graph, NONE, Partition};
+use crate::coarse::{Cycle, Edges, Graph, NONE, Partition, Places, pairs};
 use crate::control::Control;
 use crate::error::Result;
 use crate::frames::Real;
@@ -109,23 +108,18 @@ impl Source {
 }
 
 /// How far apart pixels are that see a cell in two exposures, in either direction, and the weight of that
-/// comparison: first the strong ones, of pixels that are nearly alike in what exposures barely constrain.
-///
-/// Weak ones make no aggregates, even if strong ones alone do not connect all pixels: what they barely
-/// constrain is the height of each part, so that no aggregate may reach over two.
+/// comparison: first those of strong pairs, then all others.
 fn apart(sources: &[Source]) -> [Vec<(usize, f64)>; 2] {
-    let pairs = sources.iter().flat_map(|one| sources.iter().map(move |other| (one, other)));
-    let weights = pairs
-        .map(|(one, other)| (one.behind.wrapping_sub(other.behind), one.share * other.share))
-        .filter(|&(apart, _)| apart != 0);
-    let mut apart: BTreeMap<usize, f64> = BTreeMap::new();
-    for (distance, weight) in weights {
-        let largest = apart.entry(distance).or_insert(0.0);
-        *largest = largest.max(weight);
+    let shares: Vec<f64> = sources.iter().map(|source| source.share).collect();
+    let [mut strong, mut weak] = [BTreeMap::new(), BTreeMap::new()];
+    for pair in pairs(&shares) {
+        let [one, other] = pair.places.map(|place| sources[place].behind);
+        let apart = if pair.is_strong { &mut strong } else { &mut weak };
+        let largest = apart.entry(one.wrapping_sub(other)).or_insert(0.0_f64);
+        *largest = largest.max(pair.weight);
     }
-    let least = least_strong(&sources.iter().map(|source| source.share).collect::<Vec<_>>());
-    let (strong, weak) = apart.into_iter().partition(|&(_, weight)| weight >= least);
-    [strong, weak]
+    weak.retain(|distance, _| !strong.contains_key(distance));
+    [strong, weak].map(|apart| apart.into_iter().collect())
 }
 
 /// The pixels that see a cell are compared with each other: Ω_k Ω_l / Σ Ω, with Ω = w c² L² M².

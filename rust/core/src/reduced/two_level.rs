@@ -25,10 +25,10 @@
 //! deepest waves, or aggregates of pixels where its waves are many (`ShortWaves`).
 
 use super::aggregated::Aggregated;
-use super::blocks::{ShortWaves, coarse_spaces};
+use super::blocks::coarse_spaces;
 use super::operator::Reduced;
 use super::two_level_kernel::{Close, Descend, Direction};
-use crate::coarse::{Coarse, DAMPING, Hats, Modulated, spacing};
+use crate::coarse::{Coarse, DAMPING, Hats, Modulated, ShortWaves, spacing};
 use crate::control::Control;
 use crate::error::Result;
 use crate::exposures::Exposures;
