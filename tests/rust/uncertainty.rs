@@ -201,6 +201,22 @@ fn functionals_of_free_fluxes() {
 }
 
 #[test]
+fn a_tilt_that_a_weak_exposure_alone_determines() {
+    // The others leave it to the fluxes.
+    for (shifts, turned) in [(CROSS, 90), (BETWEEN, 90), (BETWEEN, 180)] {
+        for variance in [1e-4, 1e-2] {
+            let noise = Noise::Exposures(vec![1e-6, 1e-6, 1e-6, 1e-6, variance]);
+            let experiment = Experiment { noise, ..given(&shifts, &[0, 0, 0, 0, turned]) };
+            let case = Case::new(experiment.with_lamp(Lamp::Free));
+            let [rows, cols] = SMALL;
+            let of_row = |pixel: usize| (pixel / cols) as f64 - (rows - 1) as f64 / 2.0;
+            case.check_functionals(&[(0..rows * cols).map(of_row).collect()]);
+            case.check_functionals(&case.functionals());
+        }
+    }
+}
+
+#[test]
 fn functionals_of_fluxes_with_a_prior() {
     // Between pixels the penalty resists the tilt that a prior leaves open, which no error bar knows.
     let std = vec![3e-4, 2e-4, 4e-4, 3e-4, 3e-4];

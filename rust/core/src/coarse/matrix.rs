@@ -113,7 +113,7 @@ impl Coarse {
         quotient < NOTHING
     }
 
-    /// The coarse correction: replaces a right-hand side, one value a hat, by the heights of the hats,
+    /// The coarse correction: replaces a right-hand side, one value a hat or other unknown, by their heights,
     /// times `factor`.
     ///
     /// Constants in a part are left out on either side: they are no error, and what there is of
@@ -128,11 +128,13 @@ impl Coarse {
             part.iter().for_each(|&(hat, share)| values[hat] -= share * sum / area);
         }
         cholesky.substitute(values);
+        // Other unknowns too: a tilt that they explain has both, and must get one eigenvalue.
+        values.iter_mut().for_each(|value| *value *= factor);
         for part in &self.parts {
             let (sum, area) = part.iter().fold((0.0, 0.0), |(sum, area), &(hat, share)| {
                 (sum + share * values[hat], area + share)
             });
-            part.iter().for_each(|&(hat, _)| values[hat] = factor * (values[hat] - sum / area));
+            part.iter().for_each(|&(hat, _)| values[hat] -= sum / area);
         }
     }
 }
