@@ -65,6 +65,8 @@ fn they_take_few_passes_where_fluxes_are_sought() {
         (176, unequal(&whole, [1e-6, 1e-6, 1e-8, 1e-6, 1e-6])),
         (130, unequal(&whole, [1e-6, 1e-6, 1e-6, 1e-4, 1e-4])),
         (78, unequal(&whole, [1e-6, 1e-6, 1e-4, 1e-4, 1e-4])),
+        // The two of most light have most weight, as only the fit finds.
+        (130, whole.clone().with_flux(&[1.0, 0.9, 0.1, 0.1, 0.1]).experiment()),
     ] {
         let sought = free(experiment);
         takes_to_the_truth(most, &sought, &Gauge::new(&sought, &truth).level());

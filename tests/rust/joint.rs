@@ -243,6 +243,32 @@ fn free_fluxes_leave_the_tilt_to_the_gauge() {
 }
 
 #[test]
+fn free_fluxes_may_be_far_from_those_given() {
+    // Ten times dimmer, and seven times as bright: instead of what is affine in the shifts, M would be tilted by
+    // orders of magnitude.
+    let flux = [1.0, 0.1, 2.0, 0.3, 7.0];
+    for (shifts, degrees) in
+        [(CROSS, [0; 5]), (CROSS, TURNED), (BETWEEN, [0; 5]), (BETWEEN, TURNED)]
+    {
+        let simulation = noisy(SMALL, &shifts).with_flux(&flux).turned(&degrees);
+        let experiment = simulation.experiment();
+        let known = Experiment { lamp: Lamp::Free, ..experiment };
+        let unknown = Experiment { flux: vec![1.0; 5], ..known.clone() };
+        let [near, far] =
+            [&known, &unknown].map(|given| fit(given, Options::to(TOLERANCE)).unwrap());
+        assert!(near.converged && far.converged, "{:?}", far.history.last());
+        // A tilt of the beam changes the penalty: M differs by no more than the penalty moves it.
+        let Minimum { of_penalty, .. } = Minimum::beside(&known, &near, TOLERANCE).unwrap();
+        let most = of_penalty + 2.0 * allowed(&simulation);
+        let off = apart(&far.sensitivity, &near.sensitivity);
+        assert!(off <= most, "{off:e} above {most:e}");
+        for (far, near) in far.flux.iter().zip(&near.flux) {
+            assert!((far / near - 1.0).abs() <= most);
+        }
+    }
+}
+
+#[test]
 fn a_pixel_without_an_offset_does_not_count_for_the_slope_of_the_gauge() {
     let experiment = noisy(SMALL, &CROSS).at_two_levels().experiment().with_lamp(Lamp::Free);
     let (pixels, lost) = (SMALL[0] * SMALL[1], 10);

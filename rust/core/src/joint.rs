@@ -18,6 +18,7 @@ mod conjugate_gradients;
 mod connected;
 mod few;
 mod first_beam;
+mod first_fluxes;
 mod flux;
 mod freedom;
 mod fused;
@@ -47,6 +48,7 @@ mod workspace;
 
 pub(crate) use conjugate_gradients::{ConjugateGradients, Known};
 pub(crate) use first_beam::{Source, first_beam};
+pub(crate) use first_fluxes::first_fluxes;
 pub(crate) use flux::Fluxes;
 pub(crate) use kernel::{Propagate, Row};
 pub(crate) use layout::Grid;

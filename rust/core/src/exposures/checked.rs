@@ -109,6 +109,13 @@ impl<'a, T: Real> Exposures<'a, T> {
         Ok(Self { measurements, checked: checked.clone() })
     }
 
+    /// The same exposures at other fluxes.
+    pub(crate) fn at_flux(&self, values: Vec<f64>) -> Self {
+        let mut moved = self.clone();
+        moved.checked.flux.values = values;
+        moved
+    }
+
     /// What remains without the values.
     #[must_use]
     pub const fn checked(&self) -> &Checked {

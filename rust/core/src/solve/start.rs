@@ -3,16 +3,18 @@
 use super::descent::one_sweep;
 use crate::control::Control;
 use crate::error::Result;
-use crate::exposures::Exposures;
+use crate::exposures::{Exposures, FluxKind};
 use crate::fit::Start;
-use crate::frames::Real;
+use crate::frames::{Real, Shape};
 use crate::geometry::nearest_whole;
-use crate::joint::{Fluxes, Grid, ShiftPrior, Source, State, System, first_beam};
+use crate::joint::{Fluxes, Grid, ShiftPrior, Source, State, System, first_beam, first_fluxes};
 use crate::parallel::Workers;
 use crate::reduced::{ConjugateGradients, Whole};
 use crate::sweep::{Estimate, Plain};
 use crate::weak_light::WeakLight;
 
+/// A tilt of ln M across the sensor, instead of free fluxes that are affine in the shifts, that the search is spared.
+const STEEP: f64 = 1.0;
 /// Sweeps that make the first beam.
 const FIRST_SWEEPS: u64 = 4;
 
@@ -39,15 +41,37 @@ pub(super) fn system<'m, 'a, T: Real>(
     workers: &'m Workers,
     control: &Control,
 ) -> Result<(System<'m, 'a, T>, u64)> {
-    let positions = exposures.positions();
-    let (shifts, rotations) = (positions.on_grid(&positions.shifts), &positions.rotations);
     let grid = Grid::of(exposures)?;
-    let fluxes = Fluxes::new(exposures.flux(), exposures.flux_kind(), &shifts, rotations);
+    let fluxes = fluxes(exposures, start, control)?;
     let (state, swept) = match start {
         Some(start) => (moved(start, exposures, &grid, &fluxes, workers, control)?, 0),
         None => (swept(exposures, &grid, &fluxes, workers, control)?, FIRST_SWEEPS),
     };
     Ok((System::new(exposures, grid, fluxes, state, workers, control)?, swept))
+}
+
+/// The fluxes around which the search seeks: those given, or free ones where it begins.
+fn fluxes<T: Real>(
+    exposures: &Exposures<'_, T>,
+    start: Option<&Start>,
+    control: &Control,
+) -> Result<Fluxes> {
+    let (positions, kind) = (exposures.positions(), exposures.flux_kind());
+    let shifts = positions.on_grid(&positions.shifts);
+    let around = |values: &[f64]| Fluxes::new(values, kind, &shifts, &positions.rotations);
+    let given = around(exposures.flux());
+    let first = match (kind, start) {
+        (FluxKind::Free, Some(start)) => start.flux.clone(),
+        // Unknown offsets of pixels would make fluxes seem alike.
+        (FluxKind::Free, None) if !exposures.offset() => first_fluxes(exposures, control)?,
+        _ => return Ok(given),
+    };
+    let (theta, _, slope) = given.split(&first, &shifts);
+    let Shape { rows, cols } = exposures.sensor();
+    let tilt = slope[0].abs() * rows as f64 + slope[1].abs() * cols as f64;
+    // What is affine in the shifts stays as given: F has a penalty that a tilt of the beam changes.
+    let near = given.at(&theta);
+    Ok(around(if tilt > STEEP { &first } else { &near }))
 }
 
 /// The state after some sweeps.
@@ -58,6 +82,8 @@ fn swept<T: Real>(
     workers: &Workers,
     control: &Control,
 ) -> Result<State> {
+    let theta = vec![0.0; fluxes.columns.len()];
+    let exposures = &exposures.at_flux(fluxes.at(&theta));
     let mut estimate = estimate(exposures, None, workers, control)?;
     let mut search = ConjugateGradients::new(exposures, workers, control);
     estimate.slopes::<Plain>(1.0, &mut search.residual, control)?;
@@ -74,7 +100,7 @@ fn swept<T: Real>(
     let source = Source { shape: geometry.beam, origin, value };
     Ok(State {
         beam: first_beam(grid, &source, workers, control)?,
-        theta: vec![0.0; fluxes.columns.len()],
+        theta,
         shifts: positions.on_grid(&positions.shifts),
     })
 }

@@ -1,0 +1,99 @@
+"""Free fluxes far from 1, and the tilt that one exposure of little weight determines."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+import equipix
+from equipix import simulate
+from equipix.errors import IdentifiabilityWarning
+
+NOISE = 1e-3
+CROSS = np.array([[0, 0], [0, 11], [0, 19], [11, 0], [19, 0]])
+FAR = np.array([[0, 0], [-2, 1], [11, 18], [-19, -14], [13, 18], [-10, -7]])
+
+
+def planes(shape):
+    """Images of 1, rows and columns across the sensor, as columns."""
+    rows, cols = np.indices(shape)
+    return np.column_stack([np.ones(rows.size), rows.ravel() / shape[0], cols.ravel() / shape[1]])
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.4])
+@pytest.mark.parametrize("flux", [(1, 0.2, 1, 0.5, 2), (1, 0.9, 0.1, 0.1, 0.1)])
+def test_a_lamp_may_vary_by_a_factor_of_ten(flux, fraction):
+    shape = (60, 72)
+    shifts = CROSS + fraction * np.array([[0, 0], [1, 0], [0, 1], [1, 1], [0.5, 0]])
+    truth = simulate.paper_sensitivity(shape, rng=1)
+    beam = simulate.gaussian_beam(shape, width=200)
+    frames = simulate.exposures(truth, beam, shifts, flux=flux)
+    frames += NOISE * np.random.default_rng(2).standard_normal(frames.shape)
+    variance = [NOISE**2] * 5
+    with pytest.warns(IdentifiabilityWarning, match="tilt"):
+        free = equipix.calibrate(frames, shifts, flux="fit", variance=variance, uncertainty=False)
+    given = equipix.calibrate(frames, shifts, flux=flux, variance=variance, uncertainty=False)
+    assert free.converged
+    off, least = (error_without_tilt(one.sensitivity, truth) for one in (free, given))
+    # Two combinations of fluxes are two of 4320 unknowns.
+    assert off == pytest.approx(least, rel=0.01)
+
+
+def error_without_tilt(sensitivity, truth):
+    """The error of M less the tilt that is left to the gauge, rms."""
+    off, tilts = np.log(sensitivity / truth).ravel(), planes(truth.shape)
+    return (off - tilts @ np.linalg.lstsq(tilts, off, rcond=None)[0]).std()
+
+
+@pytest.mark.filterwarnings("ignore:.*determine the orientation")
+@pytest.mark.parametrize(
+    ("lamp", "light"), [("turned", [1, 1, 1, 1, 1, 1e-2]), ("linear", [1e-2, 1e-2, 1, 1, 1, 1])]
+)
+def test_a_tilt_that_little_light_determines_has_its_standard_deviation(lamp, light):
+    shape = (48, 56)
+    count = len(FAR)
+    rotation = [0, 0, 0, 0, 0, 180 if lamp == "turned" else 0]
+    time = np.arange(count) - (count - 1) / 2
+    columns = np.eye(count) if lamp == "turned" else time[:, np.newaxis]
+    options = {"flux": "fit", "rotation": rotation}
+    if lamp == "linear":
+        options = {"flux": "linear", "time": time}
+    truth = simulate.paper_sensitivity(shape, rng=1)
+    beam = simulate.gaussian_beam(shape, width=80)
+    exact = simulate.exposures(truth, beam, FAR, rotation=rotation)
+    variance = NOISE**2 / np.array(light)
+    frames = exact + np.sqrt(variance)[:, None, None] * np.random.default_rng(100).standard_normal(
+        exact.shape
+    )
+    calibration = equipix.calibrate(frames, FAR, variance=variance, uncertainty=True, **options)
+    assert calibration.converged
+    wanted = tilt_std(exact, FAR, rotation, variance, columns)
+    # The problem at what was found is that of the truth but for noise, here 1 % of a value.
+    assert calibration.tilt_std == pytest.approx(wanted, rel=0.01)
+
+
+def tilt_std(exact, shifts, rotation, variance, columns):
+    """That of the slopes of ln M, by the normal equations of ln M, ln L and the fluxes."""
+    count, *shape = exact.shape
+    pixels = exact[0].size
+    size = np.ptp(shifts, axis=0) + shape
+    rows, cols = np.indices(shape)
+    cells = []
+    for (row, col), degrees in zip(shifts - shifts.min(axis=0), rotation, strict=True):
+        cells.append(np.rot90((rows + row) * size[1] + cols + col, degrees // 90).ravel())
+    of_beam = sparse.csr_matrix(
+        (np.ones(count * pixels), (np.arange(count * pixels), np.concatenate(cells))),
+        shape=(count * pixels, size.prod()),
+    )
+    of_pixels = sparse.vstack([sparse.identity(pixels)] * count)
+    of_lamp = sparse.kron(sparse.csr_matrix(columns), np.ones((pixels, 1)))
+    terms = sparse.hstack([of_pixels, of_beam, of_lamp]).tocsr()
+    weights = sparse.diags((exact**2 / variance[:, None, None]).ravel())
+    normal = (terms.T @ weights @ terms).tocsc()
+    # What no measurement tells, factors between M, L and c and cells out of sight, does not tilt M.
+    normal += sparse.diags(np.full(normal.shape[0], 1e-12 * normal.diagonal().max()))
+    slopes = np.zeros((normal.shape[0], 2))
+    slopes[:pixels] = np.linalg.pinv(planes(shape))[1:].T
+    return np.sqrt((slopes * splu(normal, permc_spec="MMD_AT_PLUS_A").solve(slopes)).sum(axis=0))
