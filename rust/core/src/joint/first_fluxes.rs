@@ -31,7 +31,7 @@ const RIDGE: f64 = 1e-9;
 /// What one exposure measured of a cell.
 struct Seen {
     exposure: usize,
-    /// ln (y/c₀).
+    /// ln (y/c₀), in units of the brightest value: values in another unit must give the same bits.
     log: f64,
     weight: f64,
 }
@@ -77,6 +77,7 @@ pub(crate) fn first_fluxes<T: Real>(
 fn seen<T: Real>(exposures: &Exposures<'_, T>, control: &Control) -> Result<Vec<Vec<Seen>>> {
     let (geometry, sensor, flux) = (exposures.geometry(), exposures.sensor(), exposures.flux());
     let beam = geometry.beam;
+    let brightest = exposures.brightest();
     let most = (MOST_PAIRS / flux.len().pow(2)).clamp(1, CELLS);
     let step = (beam.len() / most).isqrt().max(1);
     let mut cells = Vec::new();
@@ -97,7 +98,7 @@ fn seen<T: Real>(exposures: &Exposures<'_, T>, control: &Control) -> Result<Vec<
                         Stretch::Uniform(values, weight) => (values[0].to_f64(), weight),
                         Stretch::Weighted(values, weights) => (values[0].to_f64(), weights[0]),
                     };
-                let light = value / flux[exposure];
+                let light = value / brightest / flux[exposure];
                 let seen = Seen { exposure, log: light.ln(), weight: weight * value * value };
                 (weight > 0.0 && light > 0.0).then_some(seen)
             };
