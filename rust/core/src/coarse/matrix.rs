@@ -113,8 +113,8 @@ impl Coarse {
         quotient < NOTHING
     }
 
-    /// The coarse correction: replaces a right-hand side, one value a hat or other unknown, by their heights,
-    /// times `factor`.
+    /// The coarse correction: replaces a right-hand side by the heights of the hats and the other unknowns, times
+    /// `factor`.
     ///
     /// Constants in a part are left out on either side: they are no error, and what there is of
     /// them is rounding. If rounding in a nearly singular matrix left no factor, the heights are 0
@@ -128,7 +128,7 @@ impl Coarse {
             part.iter().for_each(|&(hat, share)| values[hat] -= share * sum / area);
         }
         cholesky.substitute(values);
-        // Other unknowns too: a tilt that they explain has both, and must get one eigenvalue.
+        // All unknowns by the same: with another for fluxes and shifts the correction is not symmetric.
         values.iter_mut().for_each(|value| *value *= factor);
         for part in &self.parts {
             let (sum, area) = part.iter().fold((0.0, 0.0), |(sum, area), &(hat, share)| {

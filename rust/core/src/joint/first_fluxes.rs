@@ -36,7 +36,7 @@ struct Seen {
     weight: f64,
 }
 
-/// The fluxes of equal pixels, of those given where data tell nothing.
+/// The fluxes of equal pixels; where no cell determines one, the flux given.
 ///
 /// # Errors
 /// [`Error::Cancelled`](crate::Error::Cancelled).
@@ -45,20 +45,21 @@ pub(crate) fn first_fluxes<T: Real>(
     control: &Control,
 ) -> Result<Vec<f64>> {
     let count = exposures.count();
+    // Its lower triangle: exposures of a cell come in their order.
     let mut matrix = vec![vec![0.0; count]; count];
     let mut logs = vec![0.0; count];
-    for cell in seen(exposures, control)? {
+    for_each_cell(exposures, control, |cell| {
         let total: f64 = cell.iter().map(|seen| seen.weight).sum();
         let mean = cell.iter().map(|seen| seen.weight * seen.log).sum::<f64>() / total;
-        for one in &cell {
+        for (index, one) in cell.iter().enumerate() {
             logs[one.exposure] += one.weight * (one.log - mean);
-            matrix[one.exposure][one.exposure] += one.weight;
-            for other in &cell {
-                matrix[one.exposure][other.exposure] -= one.weight * other.weight / total;
+            let row = &mut matrix[one.exposure];
+            row[one.exposure] += one.weight;
+            for other in &cell[..=index] {
+                row[other.exposure] -= one.weight * other.weight / total;
             }
         }
-    }
-    control.check()?;
+    })?;
     let largest = (0..count).map(|k| matrix[k][k]).fold(f64::MIN_POSITIVE, f64::max);
     let mut entries = Vec::with_capacity(count * (count + 3) / 2);
     for (row, values) in matrix.iter().enumerate() {
@@ -73,14 +74,18 @@ pub(crate) fn first_fluxes<T: Real>(
     Ok(exposures.flux().iter().zip(&logs).map(|(c, log)| c * log.exp()).collect())
 }
 
-/// The measurements of cells that more than one exposure has seen, at the nearest whole shifts.
-fn seen<T: Real>(exposures: &Exposures<'_, T>, control: &Control) -> Result<Vec<Vec<Seen>>> {
+/// Calls `visit` with the measurements of each cell that more than one exposure has seen, at the nearest whole shifts.
+fn for_each_cell<T: Real>(
+    exposures: &Exposures<'_, T>,
+    control: &Control,
+    mut visit: impl FnMut(&[Seen]),
+) -> Result<()> {
     let (geometry, sensor, flux) = (exposures.geometry(), exposures.sensor(), exposures.flux());
     let beam = geometry.beam;
     let brightest = exposures.brightest();
     let most = (MOST_PAIRS / flux.len().pow(2)).clamp(1, CELLS);
     let step = (beam.len() / most).isqrt().max(1);
-    let mut cells = Vec::new();
+    let mut cell = Vec::new();
     for row in (0..beam.rows).step_by(step) {
         control.check()?;
         for col in (0..beam.cols).step_by(step) {
@@ -103,13 +108,14 @@ fn seen<T: Real>(exposures: &Exposures<'_, T>, control: &Control) -> Result<Vec<
                 (weight > 0.0 && light > 0.0).then_some(seen)
             };
             let placed = geometry.placements.iter().enumerate();
-            let cell: Vec<Seen> = placed.filter_map(of_exposure).collect();
+            cell.clear();
+            cell.extend(placed.filter_map(of_exposure));
             if cell.len() > 1 {
-                cells.push(cell);
+                visit(&cell);
             }
         }
     }
-    Ok(cells)
+    Ok(())
 }
 
 #[cfg(test)]
@@ -169,7 +175,6 @@ mod tests {
             let found = found(&flux, rotations);
             for (c, wanted) in found.iter().map(|c| c / found[0]).zip(&flux) {
                 // A scatter of M of 3 % over some 500 pixels, of two exposures each, and 0.3 cells of the beam.
-
                 assert!((c / wanted - 1.0).abs() < 0.01, "{c} {wanted}");
             }
         }

@@ -249,13 +249,17 @@ fn is_symmetric_and_the_same(scan: &Scan, seeks_more: bool) {
         of_others[..system.state.beam.len()].fill(0.0);
         // Its arrays are in single precision; z is a sum of some 100 of their products.
         let rounding = 100.0 * f64::from(f32::EPSILON);
-        let mut size = 0.0;
-        for s in seeks_more.then_some(of_others).into_iter().chain([pulls(4711)]) {
-            let of_s = apply(&s);
-            size = (dot(&r, &of_r) * dot(&s, &of_s)).sqrt();
-            let difference = (dot(&r, &of_s) - dot(&s, &of_r)).abs();
+        let size_beside = |s: &[f64]| {
+            let of_s = apply(s);
+            let size = (dot(&r, &of_r) * dot(s, &of_s)).sqrt();
+            let difference = (dot(&r, &of_s) - dot(s, &of_r)).abs();
             assert!(size > 0.0 && difference < rounding * size, "{difference} of {size}");
+            size
+        };
+        if seeks_more {
+            size_beside(&of_others);
         }
+        let size = size_beside(&pulls(4711));
         let mut single = Vec::new();
         preconditioner.apply(system, &system.slope_in(r.clone()), &mut single, &control).unwrap();
         let single = system.step_of(single);

@@ -42,7 +42,7 @@ pub(super) fn system<'m, 'a, T: Real>(
     control: &Control,
 ) -> Result<(System<'m, 'a, T>, u64)> {
     let grid = Grid::of(exposures)?;
-    let fluxes = fluxes(exposures, start, control)?;
+    let fluxes = sought_fluxes(exposures, start, control)?;
     let (state, swept) = match start {
         Some(start) => (moved(start, exposures, &grid, &fluxes, workers, control)?, 0),
         None => (swept(exposures, &grid, &fluxes, workers, control)?, FIRST_SWEEPS),
@@ -51,15 +51,14 @@ pub(super) fn system<'m, 'a, T: Real>(
 }
 
 /// The fluxes around which the search seeks: those given, or free ones where it begins.
-fn fluxes<T: Real>(
+fn sought_fluxes<T: Real>(
     exposures: &Exposures<'_, T>,
     start: Option<&Start>,
     control: &Control,
 ) -> Result<Fluxes> {
     let (positions, kind) = (exposures.positions(), exposures.flux_kind());
     let shifts = positions.on_grid(&positions.shifts);
-    let around = |values: &[f64]| Fluxes::new(values, kind, &shifts, &positions.rotations);
-    let given = around(exposures.flux());
+    let given = Fluxes::new(exposures.flux(), kind, &shifts, &positions.rotations);
     let first = match (kind, start) {
         (FluxKind::Free, Some(start)) => start.flux.clone(),
         // Unknown offsets of pixels would make fluxes seem alike.
@@ -71,7 +70,7 @@ fn fluxes<T: Real>(
     let tilt = slope[0].abs() * rows as f64 + slope[1].abs() * cols as f64;
     // What is affine in the shifts stays as given: F has a penalty that a tilt of the beam changes.
     let near = given.at(&theta);
-    Ok(around(if tilt > STEEP { &first } else { &near }))
+    Ok(given.around(if tilt > STEEP { first } else { near }))
 }
 
 /// The state after some sweeps.
