@@ -85,7 +85,7 @@ impl History {
 /// What F may rise by through rounding: that of a sum, and of residuals that are rounding alone.
 pub(crate) fn rounding<T: Real>(exposures: &Exposures<'_, T>, objective: f64) -> f64 {
     let residual = 4.0 * f64::EPSILON * exposures.brightest();
-    let weights: f64 = exposures.exposure_weights().iter().sum();
+    let weights: f64 = exposures.exposure_weights(exposures.flux()).iter().sum();
     1e-12 * objective + weights * residual * residual
 }
 

@@ -27,13 +27,13 @@ pub(crate) enum ShortWaves {
 }
 
 impl ShortWaves {
-    /// That of these exposures. Where they are turned against each other no wave is seen as one.
-    pub(crate) fn of<T: Real>(exposures: &Exposures<'_, T>) -> Self {
+    /// That of these exposures at these fluxes. Where they are turned against each other no wave is seen as one.
+    pub(crate) fn of<T: Real>(exposures: &Exposures<'_, T>, flux: &[f64]) -> Self {
         let geometry = exposures.geometry();
         if geometry.views.len() > 1 {
             return Self::Waves(Vec::new());
         }
-        let places = Places::of(exposures);
+        let places = Places::of(exposures, flux);
         let reach = [0, 1].map(|axis| {
             let along = places.at.iter().map(|place| place[axis]);
             along.clone().max().unwrap_or(0) - along.min().unwrap_or(0)
@@ -91,7 +91,7 @@ pub(crate) struct Places {
 }
 
 impl Places {
-    pub(crate) fn of<T: Real>(all: &Exposures<'_, T>) -> Self {
+    pub(crate) fn of<T: Real>(all: &Exposures<'_, T>, flux: &[f64]) -> Self {
         let (mut at, mut exposures): (Vec<_>, Vec<Vec<usize>>) = (Vec::new(), Vec::new());
         for (exposure, place) in all.geometry().placements.iter().enumerate() {
             let place = [place.row, place.col];
@@ -103,7 +103,7 @@ impl Places {
                 }
             }
         }
-        let each = all.shares();
+        let each = all.shares(flux);
         let share = |alike: &Vec<usize>| alike.iter().map(|&exposure| each[exposure]).sum();
         let shares = exposures.iter().map(share).collect();
         Self { at, exposures, shares }
@@ -195,7 +195,7 @@ mod tests {
         let positions = Positions::of_shifts(shifts);
         let exposures =
             Exposures::new(measurements, positions, flux, false, &workers, &control).unwrap();
-        let short = ShortWaves::of(&exposures);
+        let short = ShortWaves::of(&exposures, exposures.flux());
         let aggregates = match short {
             ShortWaves::Aggregates { bytes, places } => Some([bytes, places]),
             ShortWaves::Waves(_) => None,

@@ -224,16 +224,16 @@ impl<'a, T: Real> Exposures<'a, T> {
         tallies.map(|(tally, c)| tally.largest / c).fold(0.0, f64::max)
     }
 
-    /// The weight that each exposure has in all: Σ_p w c².
+    /// The weight that each exposure has in all at these fluxes: Σ_p w c².
     #[must_use]
-    pub fn exposure_weights(&self) -> Vec<f64> {
-        let tallies = self.checked.tallies.iter().zip(self.flux());
+    pub fn exposure_weights(&self, flux: &[f64]) -> Vec<f64> {
+        let tallies = self.checked.tallies.iter().zip(flux);
         tallies.map(|(tally, c)| tally.weight * c * c).collect()
     }
 
     /// The share of each exposure in all weights.
-    pub(crate) fn shares(&self) -> Vec<f64> {
-        let weights = self.exposure_weights();
+    pub(crate) fn shares(&self, flux: &[f64]) -> Vec<f64> {
+        let weights = self.exposure_weights(flux);
         let total: f64 = weights.iter().sum();
         weights.iter().map(|weight| weight / total).collect()
     }

@@ -11,6 +11,7 @@
 //! not count that.
 
 use super::layout::Grid;
+use super::pass::Pass;
 use super::system::System;
 use super::wide::Wide;
 use crate::coarse::{Cycle, Edges, NONE, Partition, Places, ShortWaves, pairs};
@@ -40,7 +41,8 @@ impl Aggregated {
         system: &mut System<'_, '_, T>,
         control: &Control,
     ) -> Result<Option<Self>> {
-        if bytes_needed(system.pass.exposures, &system.pass.grid).is_none() {
+        let Pass { exposures, flux, grid, .. } = &system.pass;
+        if bytes_needed(exposures, flux, grid).is_none() {
             return Ok(None);
         }
         let workers = system.pass.workers;
@@ -85,13 +87,19 @@ impl Aggregated {
 }
 
 /// What aggregates take in bytes where they stand for the waves of these exposures, with what their matrix is summed
-/// from: `None` where waves are fewer as the fluxes were given, where the beam is a spline, or its views are turned.
-pub(super) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>, grid: &Grid) -> Option<u64> {
+/// from: `None` where waves are fewer at these fluxes, where the beam is a spline, or its views are turned.
+pub(super) fn bytes_needed<T: Real>(
+    exposures: &Exposures<'_, T>,
+    flux: &[f64],
+    grid: &Grid,
+) -> Option<u64> {
     let is_turned = grid.geometry.views.iter().any(|view| view.rotation != Rotation::None);
     if is_turned || grid.is_spline() {
         return None;
     }
-    let ShortWaves::Aggregates { bytes, places } = ShortWaves::of(exposures) else { return None };
+    let ShortWaves::Aggregates { bytes, places } = ShortWaves::of(exposures, flux) else {
+        return None;
+    };
     let of_pixel = size_of::<f32>() * (places + 1);
     Some((bytes * grid.geometry.beam.len() + of_pixel * grid.sensor.len()) as u64)
 }
@@ -111,7 +119,7 @@ impl Seen {
     fn new<T: Real>(system: &mut System<'_, '_, T>, control: &Control) -> Result<Self> {
         system.pass.count += 1;
         let pass = &system.pass;
-        let Places { exposures, .. } = Places::of(pass.exposures);
+        let Places { exposures, .. } = Places::of(pass.exposures, &pass.flux);
         let sensor = pass.exposures.sensor();
         let [light, weight] = system.ordinary;
         let unit = weight * light * light;

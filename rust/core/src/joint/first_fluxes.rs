@@ -1,18 +1,17 @@
 //! Where a search for free fluxes begins: at those of equal pixels.
 //!
-//! Gauss-Newton steps do not find fluxes that are a few times what they begin at. With M = 1,
+//! Gauss-Newton steps do not find fluxes that are a few times what they begin at. With M = 1 two exposures show the
+//! same light in the cells u that both see, but for their fluxes:
 //!
 //! ```text
-//! ln y_k(u) = ln L(u) + ln c_k,   of weight ω = w y²
+//! ln c_k − ln c_l = ln (S_kl/S_lk),   S_kl = Σ_u ω y_k,   ω = w_k w_l/(w_k + w_l)
 //! ```
 //!
-//! is linear in the logarithms, and the noise of pixels averages out over few cells. Beside the fluxes c₀ given,
+//! The sums are linear in y: noise and unequal pixels average out, and values below 0 count as they are. A ratio
+//! whose fluxes are alike has the variance Σω/(S_kl S_lk), by which ln c is the least-squares solution of all pairs.
 //!
-//! ```text
-//! Σ_u (diag ω − ω ωᵀ/Σω) ln (c/c₀) = Σ_u ω (ln (y/c₀) − Σ ω ln (y/c₀)/Σω)
-//! ```
-//!
-//! Logarithms that are affine in the shifts are found too, which the fit leaves to the gauge (`joint/flux.rs`).
+//! What is affine in the shifts is found too, which the fit leaves to the gauge (`joint/flux.rs`): so the search begins
+//! without the tilt of M that would stand for it.
 
 use crate::control::Control;
 use crate::error::Result;
@@ -21,18 +20,27 @@ use crate::frames::Real;
 use crate::geometry::Placement;
 use crate::linalg::Cholesky;
 
-/// Cells that are looked at, evenly over the beam.
-const CELLS: usize = 1 << 16;
+/// Upper limit on the cells that are looked at, evenly over the beam.
+const MOST_CELLS: usize = 1 << 18;
 /// Upper limit on the pairs of measurements of a cell that are summed.
 const MOST_PAIRS: usize = 1 << 28;
-/// Added to the diagonal, as a share of the largest: what no cell tells of fluxes stays as given.
-const RIDGE: f64 = 1e-9;
+/// Added to the diagonal, as a share of itself: a common factor stays as given.
+const RIDGE: f64 = 1e-12;
 
 /// What one exposure measured of a cell.
 struct Seen {
     exposure: usize,
-    /// ln (y/c₀), in units of the brightest value: values in another unit must give the same bits.
-    log: f64,
+    /// y/c₀.
+    light: f64,
+    weight: f64,
+}
+
+/// What two exposures measured of the cells that both see.
+#[derive(Clone, Copy, Default)]
+struct Pair {
+    /// S of the one and of the other.
+    light: [f64; 2],
+    /// Σω.
     weight: f64,
 }
 
@@ -45,36 +53,47 @@ pub(crate) fn first_fluxes<T: Real>(
     control: &Control,
 ) -> Result<Vec<f64>> {
     let count = exposures.count();
-    // Its lower triangle: exposures of a cell come in their order.
-    let mut matrix = vec![vec![0.0; count]; count];
-    let mut logs = vec![0.0; count];
+    let mut pairs = vec![vec![Pair::default(); count]; count];
     for_each_cell(exposures, control, |cell| {
-        let total: f64 = cell.iter().map(|seen| seen.weight).sum();
-        let mean = cell.iter().map(|seen| seen.weight * seen.log).sum::<f64>() / total;
         for (index, one) in cell.iter().enumerate() {
-            logs[one.exposure] += one.weight * (one.log - mean);
-            let row = &mut matrix[one.exposure];
-            row[one.exposure] += one.weight;
-            for other in &cell[..=index] {
-                row[other.exposure] -= one.weight * other.weight / total;
+            for other in &cell[..index] {
+                let weight = one.weight * (other.weight / (one.weight + other.weight));
+                let pair = &mut pairs[one.exposure][other.exposure];
+                pair.light[0] += weight * one.light;
+                pair.light[1] += weight * other.light;
+                pair.weight += weight;
             }
         }
     })?;
-    let largest = (0..count).map(|k| matrix[k][k]).fold(f64::MIN_POSITIVE, f64::max);
-    let mut entries = Vec::with_capacity(count * (count + 3) / 2);
-    for (row, values) in matrix.iter().enumerate() {
-        entries.push((row as u32, row as u32, RIDGE * largest));
-        let lower = values[..=row].iter().enumerate();
-        entries.extend(lower.map(|(col, value)| (row as u32, col as u32, *value)));
+    let (mut matrix, mut logs) = (Vec::new(), vec![0.0; count]);
+    let mut diagonal = vec![0.0; count];
+    for (k, of_exposure) in pairs.iter().enumerate() {
+        for (l, Pair { light: [one, other], weight }) in of_exposure.iter().enumerate() {
+            // Noise alone tells nothing.
+            if *one > 0.0 && *other > 0.0 {
+                let precision = one / weight * other;
+                let pull = precision * (one / other).ln();
+                matrix.push((k as u32, l as u32, -precision));
+                for (exposure, pull) in [(k, pull), (l, -pull)] {
+                    diagonal[exposure] += precision;
+                    logs[exposure] += pull;
+                }
+            }
+        }
     }
-    match Cholesky::new(count, &entries) {
+    matrix.extend(diagonal.iter().enumerate().map(|(k, &own)| {
+        let own = if own > 0.0 { own * (1.0 + RIDGE) } else { 1.0 };
+        (k as u32, k as u32, own)
+    }));
+    match Cholesky::new(count, &matrix) {
         Some(factor) => factor.substitute(&mut logs),
+        // Only numbers near the ends of what a double holds: the fluxes given are as good.
         None => logs.fill(0.0),
     }
     Ok(exposures.flux().iter().zip(&logs).map(|(c, log)| c * log.exp()).collect())
 }
 
-/// Calls `visit` with the measurements of each cell that more than one exposure has seen, at the nearest whole shifts.
+/// Calls `visit` with the measurements of cells, at the nearest whole shifts.
 fn for_each_cell<T: Real>(
     exposures: &Exposures<'_, T>,
     control: &Control,
@@ -82,9 +101,9 @@ fn for_each_cell<T: Real>(
 ) -> Result<()> {
     let (geometry, sensor, flux) = (exposures.geometry(), exposures.sensor(), exposures.flux());
     let beam = geometry.beam;
-    let brightest = exposures.brightest();
-    let most = (MOST_PAIRS / flux.len().pow(2)).clamp(1, CELLS);
-    let step = (beam.len() / most).isqrt().max(1);
+    let most = (MOST_PAIRS / flux.len().pow(2)).clamp(1, MOST_CELLS);
+    // An odd one meets all colours of a filter array.
+    let step = (beam.len() as f64 / most as f64).sqrt().ceil() as usize | 1;
     let mut cell = Vec::new();
     for row in (0..beam.rows).step_by(step) {
         control.check()?;
@@ -103,16 +122,14 @@ fn for_each_cell<T: Real>(
                         Stretch::Uniform(values, weight) => (values[0].to_f64(), weight),
                         Stretch::Weighted(values, weights) => (values[0].to_f64(), weights[0]),
                     };
-                let light = value / brightest / flux[exposure];
-                let seen = Seen { exposure, log: light.ln(), weight: weight * value * value };
-                (weight > 0.0 && light > 0.0).then_some(seen)
+                let c = flux[exposure];
+                let seen = Seen { exposure, light: value / c, weight: weight * c * c };
+                (weight > 0.0).then_some(seen)
             };
             let placed = geometry.placements.iter().enumerate();
             cell.clear();
             cell.extend(placed.filter_map(of_exposure));
-            if cell.len() > 1 {
-                visit(&cell);
-            }
+            visit(&cell);
         }
     }
     Ok(())

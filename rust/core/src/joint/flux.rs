@@ -89,11 +89,6 @@ impl Fluxes {
         Self { values: values.to_vec(), columns, weights, precisions, slope, hidden_slope, open }
     }
 
-    /// The same columns around other values.
-    pub(crate) fn around(self, values: Vec<f64>) -> Self {
-        Self { values, ..self }
-    }
-
     /// c at θ.
     pub(crate) fn at(&self, theta: &[f64]) -> Vec<f64> {
         let logs = self.spread(theta);

@@ -10,7 +10,7 @@ use crate::exposures::Exposures;
 use crate::frames::Real;
 use crate::geometry::Rotation;
 
-/// What the joint fit holds beside the measurements at its fullest, in bytes:
+/// What the joint fit at these fluxes holds beside the measurements at its fullest, in bytes:
 ///
 /// | array | in bytes |
 /// |---|---|
@@ -29,12 +29,12 @@ use crate::geometry::Rotation;
 ///
 /// # Errors
 /// [`Error::Value`](crate::Error::Value) for shifts that no grid can have.
-pub(crate) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>) -> Result<u64> {
+pub(crate) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>, flux: &[f64]) -> Result<u64> {
     let positions = exposures.positions();
     let shifts = positions.on_grid(&positions.shifts);
     let fitted = positions.std.is_some();
     let grid = Grid::of(exposures)?;
-    let of_aggregates = aggregated::bytes_needed(exposures, &grid).unwrap_or(0);
+    let of_aggregates = aggregated::bytes_needed(exposures, flux, &grid).unwrap_or(0);
     Ok(bytes_of(&grid, &shifts, fitted, exposures.offset()) + of_aggregates)
 }
 
@@ -60,8 +60,11 @@ fn bytes_of(grid: &Grid, shifts: &[[f64; 2]], fitted: bool, offset: bool) -> u64
 ///
 /// # Errors
 /// As [`bytes_needed`].
-pub(crate) fn bytes_needed_by_covariance<T: Real>(exposures: &Exposures<'_, T>) -> Result<u64> {
-    Ok(bytes_needed(exposures)? + 112 * exposures.geometry().sensor.len() as u64)
+pub(crate) fn bytes_needed_by_covariance<T: Real>(
+    exposures: &Exposures<'_, T>,
+    flux: &[f64],
+) -> Result<u64> {
+    Ok(bytes_needed(exposures, flux)? + 112 * exposures.geometry().sensor.len() as u64)
 }
 
 #[cfg(test)]

@@ -23,7 +23,7 @@ pub(crate) fn unknowns<T: Real>(system: &System<'_, '_, T>) -> usize {
     if !system.pass.grid.is_spline() {
         return seen + params;
     }
-    let shares = system.pass.exposures.shares();
+    let shares = system.pass.exposures.shares(&system.pass.flux);
     let windows = system.pass.grid.windows(&system.state.shifts);
     (determined_share(&windows, &shares, SMOOTHING) * seen as f64).round() as usize + params
 }

@@ -62,7 +62,7 @@ impl<T: Real> System<'_, '_, T> {
     /// The information that noise of variance 1 feigns along rows and columns, all exposures together, by
     /// raw slopes and by smoothed ones.
     fn slope_noise(&self) -> [[f64; 2]; 2] {
-        let shares = self.pass.exposures.shares();
+        let shares = self.pass.exposures.shares(&self.pass.flux);
         let windows = self.pass.grid.windows(&self.state.shifts);
         let seen = self.weights.iter().filter(|&&weight| weight > 0.0).count() as f64;
         let slope = |q: f64| q.sin().powi(2);

@@ -48,7 +48,8 @@ impl<T: Real> System<'_, '_, T> {
         let windows = self.pass.grid.windows(&self.state.shifts);
         let exposures = self.pass.exposures;
         let pixels = self.used() as f64 / exposures.count() as f64;
-        self.shift_noise = curvature(&windows, &exposures.shares(), SMOOTHING);
+        let shares = exposures.shares(&self.pass.flux);
+        self.shift_noise = curvature(&windows, &shares, SMOOTHING);
         self.shift_noise.iter_mut().for_each(|noise| *noise *= self.unit * pixels);
     }
 

@@ -4,6 +4,7 @@ use super::aggregated;
 use super::flux::Fluxes;
 use super::layout::Grid;
 use super::memory::bytes_needed;
+use super::pass::Pass;
 use super::preconditioner::{FROM_RIM, Preconditioner, around};
 use super::rim::{NEAR_OF_TURNED as NEAR, Rim};
 use super::system::System;
@@ -219,8 +220,8 @@ fn is_symmetric_and_the_same(scan: &Scan, seeks_more: bool) {
     let (variance, mask) = uneven(scan.sensor);
     let (variance, mask) = (each(&variance, scan.sensor), Mask::Measurements(&mask));
     with_system(scan, &variance, &mask, seeks_more, |system| {
-        let grid = &system.pass.grid;
-        let are_many = aggregated::bytes_needed(system.pass.exposures, grid).is_some();
+        let Pass { exposures, flux, grid, .. } = &system.pass;
+        let are_many = aggregated::bytes_needed(exposures, flux, grid).is_some();
         assert_eq!(are_many, !grid.is_spline());
         let control = Control::new();
         let preconditioner = Preconditioner::new(system, &control).unwrap();
@@ -279,10 +280,10 @@ fn aggregates_are_counted_and_none_are_of_turned_exposures() {
         let mut found = (0, None, 0);
         let scan = Scan { rotations: [rotation; 4], ..FAR };
         with_system(&scan, &Variance::Unknown, &Mask::None, false, |system| {
-            let (exposures, grid) = (system.pass.exposures, &system.pass.grid);
-            let of_aggregates = aggregated::bytes_needed(exposures, grid);
+            let Pass { exposures, flux, grid, .. } = &system.pass;
+            let of_aggregates = aggregated::bytes_needed(exposures, flux, grid);
             let of_view = 16 * grid.geometry.beam.len() as u64;
-            found = (bytes_needed(exposures).unwrap(), of_aggregates, of_view);
+            found = (bytes_needed(exposures, flux).unwrap(), of_aggregates, of_view);
         });
         found
     };

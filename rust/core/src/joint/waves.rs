@@ -129,10 +129,7 @@ fn seen<T: Real>(system: &System<'_, '_, T>, hats: &Hats) -> Vec<SeenWave> {
     let windows = &system.pass.windows;
     let is_spline = system.pass.grid.is_spline();
     let taps = Taps { windows, stiffness: if is_spline { SMOOTHING } else { 0.0 } };
-    let weights = system.pass.exposures.exposure_weights();
-    let weighed = weights.iter().zip(&system.pass.flux).map(|(weight, c)| weight * c * c);
-    let shares: Vec<f64> =
-        weighed.clone().map(|weight| weight / weighed.clone().sum::<f64>()).collect();
+    let shares = system.pass.exposures.shares(&system.pass.flux);
     let reach = [0, 1].map(|axis| {
         let place = |window: &Window| [window.row, window.col][axis];
         let places = windows.iter().map(place);

@@ -15,7 +15,7 @@ const BLOCKS: usize = 3;
 /// What the coarse spaces of these exposures take, in bytes: those of aggregates for each place of the padded
 /// sensor.
 pub(super) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>, places: u64) -> u64 {
-    let short = ShortWaves::of(exposures);
+    let short = ShortWaves::of(exposures, exposures.flux());
     let of_aggregates = match short {
         ShortWaves::Aggregates { bytes, .. } => bytes as u64 * places,
         ShortWaves::Waves(_) => 0,

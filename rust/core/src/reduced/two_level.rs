@@ -68,7 +68,7 @@ impl<'m> TwoLevel<'m> {
             workers,
             padding,
             hats,
-            short: ShortWaves::of(exposures),
+            short: ShortWaves::of(exposures, exposures.flux()),
             coarse: None,
             heights,
             spread,

@@ -51,7 +51,7 @@ const TYPICAL: u64 = 120;
 /// the estimate no longer falls.
 ///
 /// # Errors
-/// [`Error::Memory`](crate::Error::Memory) before anything else if the memory for it cannot be had;
+/// [`Error::Memory`](crate::Error::Memory) before the first step if the memory for it cannot be had;
 /// [`Error::Value`](crate::Error::Value) for a tolerance that is not a positive number or a limit of
 /// 0, [`Error::Cancelled`](crate::Error::Cancelled) if `control` asks to stop.
 pub(super) fn minimise<T: Real>(
@@ -61,7 +61,9 @@ pub(super) fn minimise<T: Real>(
     workers: &Workers,
     control: &Control,
 ) -> Result<Found> {
-    memory::check(Start::bytes_beside(start.as_ref(), joint::bytes_needed(exposures)?), || {
+    let exposures = &start::at_first_fluxes(exposures, start.as_ref(), control)?;
+    let needed = joint::bytes_needed(exposures, exposures.flux())?;
+    memory::check(Start::bytes_beside(start.as_ref(), needed), || {
         format!("fitting {} exposures of {} jointly", exposures.count(), exposures.sensor())
     })?;
     let mut steps = Steps::new(exposures, options, start, workers, control)?;

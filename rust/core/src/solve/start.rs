@@ -5,7 +5,7 @@ use crate::control::Control;
 use crate::error::Result;
 use crate::exposures::{Exposures, FluxKind};
 use crate::fit::Start;
-use crate::frames::{Real, Shape};
+use crate::frames::Real;
 use crate::geometry::nearest_whole;
 use crate::joint::{Fluxes, Grid, ShiftPrior, Source, State, System, first_beam, first_fluxes};
 use crate::parallel::Workers;
@@ -13,8 +13,6 @@ use crate::reduced::{ConjugateGradients, Whole};
 use crate::sweep::{Estimate, Plain};
 use crate::weak_light::WeakLight;
 
-/// A tilt of ln M across the sensor, instead of free fluxes that are affine in the shifts, that the search is spared.
-const STEEP: f64 = 1.0;
 /// Sweeps that make the first beam.
 const FIRST_SWEEPS: u64 = 4;
 
@@ -42,47 +40,42 @@ pub(super) fn system<'m, 'a, T: Real>(
     control: &Control,
 ) -> Result<(System<'m, 'a, T>, u64)> {
     let grid = Grid::of(exposures)?;
-    let fluxes = sought_fluxes(exposures, start, control)?;
+    let positions = exposures.positions();
+    let shifts = positions.on_grid(&positions.shifts);
+    let kind = exposures.flux_kind();
+    let fluxes = Fluxes::new(exposures.flux(), kind, &shifts, &positions.rotations);
     let (state, swept) = match start {
         Some(start) => (moved(start, exposures, &grid, &fluxes, workers, control)?, 0),
-        None => (swept(exposures, &grid, &fluxes, workers, control)?, FIRST_SWEEPS),
+        None => {
+            let beam = swept(exposures, &grid, workers, control)?;
+            (State { beam, theta: vec![0.0; fluxes.columns.len()], shifts }, FIRST_SWEEPS)
+        }
     };
     Ok((System::new(exposures, grid, fluxes, state, workers, control)?, swept))
 }
 
-/// The fluxes around which the search seeks: those given, or free ones where it begins.
-fn sought_fluxes<T: Real>(
-    exposures: &Exposures<'_, T>,
+/// The exposures at the fluxes where the search begins: those given, or free ones of the other fit or of equal pixels.
+pub(super) fn at_first_fluxes<'a, T: Real>(
+    exposures: &Exposures<'a, T>,
     start: Option<&Start>,
     control: &Control,
-) -> Result<Fluxes> {
-    let (positions, kind) = (exposures.positions(), exposures.flux_kind());
-    let shifts = positions.on_grid(&positions.shifts);
-    let given = Fluxes::new(exposures.flux(), kind, &shifts, &positions.rotations);
-    let first = match (kind, start) {
+) -> Result<Exposures<'a, T>> {
+    let first = match (exposures.flux_kind(), start) {
         (FluxKind::Free, Some(start)) => start.flux.clone(),
         // Unknown offsets of pixels would make fluxes seem alike.
         (FluxKind::Free, None) if !exposures.offset() => first_fluxes(exposures, control)?,
-        _ => return Ok(given),
+        _ => exposures.flux().to_vec(),
     };
-    let (theta, _, slope) = given.split(&first, &shifts);
-    let Shape { rows, cols } = exposures.sensor();
-    let tilt = slope[0].abs() * rows as f64 + slope[1].abs() * cols as f64;
-    // What is affine in the shifts stays as given: F has a penalty that a tilt of the beam changes.
-    let near = given.at(&theta);
-    Ok(given.around(if tilt > STEEP { first } else { near }))
+    Ok(exposures.at_flux(first))
 }
 
-/// The state after some sweeps.
+/// The beam after some sweeps.
 fn swept<T: Real>(
     exposures: &Exposures<'_, T>,
     grid: &Grid,
-    fluxes: &Fluxes,
     workers: &Workers,
     control: &Control,
-) -> Result<State> {
-    let theta = vec![0.0; fluxes.columns.len()];
-    let exposures = &exposures.at_flux(fluxes.at(&theta));
+) -> Result<Vec<f64>> {
     let mut estimate = estimate(exposures, None, workers, control)?;
     let mut search = ConjugateGradients::new(exposures, workers, control);
     estimate.slopes::<Plain>(1.0, &mut search.residual, control)?;
@@ -92,16 +85,12 @@ fn swept<T: Real>(
         one_sweep(&mut estimate, &mut search, control)?;
     }
     drop(search);
-    let (geometry, positions) = (exposures.geometry(), exposures.positions());
+    let geometry = exposures.geometry();
     let (known, places) = (&estimate.beams()[0], geometry.views[0].places);
     let value = |row, col| known[places.at(row, col)];
     let origin = geometry.origin.map(|cell| cell as i64);
     let source = Source { shape: geometry.beam, origin, value };
-    Ok(State {
-        beam: first_beam(grid, &source, workers, control)?,
-        theta,
-        shifts: positions.on_grid(&positions.shifts),
-    })
+    first_beam(grid, &source, workers, control)
 }
 
 /// The state of another fit on this grid: its coefficients, or values at cells; its fluxes and, if they

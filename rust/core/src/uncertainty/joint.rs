@@ -98,7 +98,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         workers: &'m Workers,
         control: &Control,
     ) -> Result<Self> {
-        memory::check(joint::bytes_needed_by_covariance(exposures)?, || {
+        memory::check(joint::bytes_needed_by_covariance(exposures, solution.flux)?, || {
             format!("the uncertainty of {} exposures of {}", exposures.count(), exposures.sensor())
         })?;
         let mut system = problem(exposures, solution, workers, control)?;
