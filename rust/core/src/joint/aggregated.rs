@@ -291,7 +291,7 @@ mod tests {
             let flux = vec![1.0, 0.7, 1.6, 0.4, 1.2];
             let lamp = Flux { values: flux.clone(), kind: FluxKind::Known };
             let positions = Positions::of_shifts(&SHIFTS);
-            let fluxes = Fluxes::new(&flux, &FluxKind::Known, &SHIFTS, &positions.rotations);
+            let fluxes = Fluxes::new(&flux, &FluxKind::Known, &SHIFTS, &positions.rotations, &flux);
             let exposures =
                 Exposures::new(measurements, positions, lamp, false, &workers, &control).unwrap();
             let grid = Grid::of(&exposures).unwrap();

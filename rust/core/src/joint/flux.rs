@@ -5,6 +5,9 @@
 //! other. So free fluxes are sought where ln c has no part that is affine in the shifts, and what
 //! remains undetermined is left to the gauge. With a prior of weights π the same is done with
 //! Σ π a b in place of Σ a b: then the best of the parts that no measurement determines is the given one.
+//!
+//! Free fluxes are sought with the weights of their exposures as π. Else a flux that a light exposure barely
+//! determines would change those of heavy ones, which only a tilt of M makes up for: a step along a curve.
 
 use crate::exposures::FluxKind;
 use crate::geometry::Rotation;
@@ -35,12 +38,13 @@ pub(crate) struct Fluxes {
 const NOTHING: f64 = 1e-9;
 
 impl Fluxes {
-    /// Fluxes of these values at θ = 0.
+    /// Fluxes of these values at θ = 0, of exposures of these weights.
     pub(crate) fn new(
         values: &[f64],
         flux: &FluxKind,
         shifts: &[[f64; 2]],
         rotations: &[Rotation],
+        weights: &[f64],
     ) -> Self {
         let count = shifts.len();
         let turned = rotations.iter().any(|rotation| *rotation != rotations[0]);
@@ -55,12 +59,16 @@ impl Fluxes {
         let (mut slope, mut hidden_slope) = ([0.0; 2], [[0.0; 2]; 2]);
         let weights: Vec<f64> = match flux {
             FluxKind::Prior(std) => std.iter().map(|std| 1.0 / (std * std)).collect(),
-            _ => vec![1.0; count],
+            FluxKind::Free => relative(weights),
+            FluxKind::Known | FluxKind::Linear(_) => vec![1.0; count],
         };
+        let mut by_weight: Vec<usize> = (0..count).collect();
+        // What a light exposure adds is not to be the rounding of what heavy ones leave.
+        by_weight.sort_by(|&a, &b| weights[a].total_cmp(&weights[b]));
         let (columns, precisions, open) = match flux {
             FluxKind::Known => (Vec::new(), Vec::new(), Vec::new()),
             FluxKind::Free => {
-                let free = complement(&hidden(turned), (0..count).map(unit), &weights);
+                let free = complement(&hidden(turned), by_weight.into_iter().map(unit), &weights);
                 let open = if turned { Vec::new() } else { vec![[1.0, 0.0], [0.0, 1.0]] };
                 (free, Vec::new(), open)
             }
@@ -77,7 +85,7 @@ impl Fluxes {
                 (distinct, Vec::new(), open)
             }
             FluxKind::Prior(_) => {
-                let free = complement(&hidden(turned), (0..count).map(unit), &weights);
+                let free = complement(&hidden(turned), by_weight.into_iter().map(unit), &weights);
                 let precisions = vec![1.0; free.len()];
                 if !turned {
                     hidden_slope = slope_covariance(&weights, shifts);
@@ -133,6 +141,12 @@ impl Fluxes {
         let dot = |column: &Vec<f64>| column.iter().zip(slopes).map(|(t, b)| t * b).sum();
         self.columns.iter().map(dot).collect()
     }
+}
+
+/// Weights in units of the largest, above what rounding leaves of it.
+fn relative(weights: &[f64]) -> Vec<f64> {
+    let largest = weights.iter().copied().fold(f64::MIN_POSITIVE, f64::max);
+    weights.iter().map(|weight| (weight / largest).max(f64::EPSILON)).collect()
 }
 
 /// The covariance of γ in ln c = a + γ·d, of the weights of each ln c: (Σ π (d − d̄)(d − d̄)ᵀ)⁻¹.
@@ -220,7 +234,8 @@ mod tests {
 
     #[test]
     fn free_fluxes_have_no_part_that_looks_like_a_tilt() {
-        let fluxes = Fluxes::new(&[1.0; 5], &FluxKind::Free, &CROSS, &[Rotation::None; 5]);
+        let fluxes =
+            Fluxes::new(&[1.0; 5], &FluxKind::Free, &CROSS, &[Rotation::None; 5], &[1.0; 5]);
         assert_eq!(fluxes.open, [[1.0, 0.0], [0.0, 1.0]]);
         assert_eq!(fluxes.columns.len(), 2);
         for column in &fluxes.columns {
@@ -235,7 +250,7 @@ mod tests {
     fn a_turned_exposure_determines_all_but_the_mean() {
         let mut rotations = [Rotation::None; 5];
         rotations[4] = Rotation::Half;
-        let fluxes = Fluxes::new(&[1.0; 5], &FluxKind::Free, &CROSS, &rotations);
+        let fluxes = Fluxes::new(&[1.0; 5], &FluxKind::Free, &CROSS, &rotations, &[1.0; 5]);
         assert!(fluxes.open.is_empty());
         assert_eq!(fluxes.columns.len(), 4);
     }
@@ -244,13 +259,14 @@ mod tests {
     fn a_drift_that_is_linear_along_the_shifts_is_not_determined() {
         let line = [[0.0, 0.0], [0.0, 3.0], [0.0, 6.0], [0.0, 9.0]];
         let times = |scale: f64| FluxKind::Linear((0..4).map(|k| scale * f64::from(k)).collect());
-        let fluxes = Fluxes::new(&[1.0; 4], &times(60.0), &line, &[Rotation::None; 4]);
+        let fluxes = Fluxes::new(&[1.0; 4], &times(60.0), &line, &[Rotation::None; 4], &[1.0; 4]);
         assert!(fluxes.open == [[0.0, 1.0]] && fluxes.columns.is_empty());
         let fluxes = Fluxes::new(
             &[1.0; 4],
             &FluxKind::Linear(vec![0.0, 3.0, 1.0, 2.0]),
             &line,
             &[Rotation::None; 4],
+            &[1.0; 4],
         );
         assert!(fluxes.open.is_empty() && fluxes.columns.len() == 1);
     }
@@ -259,7 +275,7 @@ mod tests {
     fn a_linear_drift_is_its_distinct_and_its_affine_part() {
         let times = [3.0, 10.0, 21.0, 30.0, 47.0];
         let flux = FluxKind::Linear(times.to_vec());
-        let fluxes = Fluxes::new(&[1.0; 5], &flux, &CROSS, &[Rotation::None; 5]);
+        let fluxes = Fluxes::new(&[1.0; 5], &flux, &CROSS, &[Rotation::None; 5], &[1.0; 5]);
         let distinct = &fluxes.columns[0];
         let [row, col] = fluxes.slope;
         let whole: Vec<f64> =

@@ -94,7 +94,8 @@ struct Source {
 
 impl Source {
     fn all<T: Real>(reduced: &Reduced<'_, '_, T>) -> Vec<Self> {
-        let Places { at, exposures, shares } = Places::of(reduced.exposures, reduced.exposures.flux());
+        let Places { at, exposures, shares } =
+            Places::of(reduced.exposures, reduced.exposures.flux());
         let places = at.into_iter().zip(exposures).zip(shares);
         places
             .map(|(([row, col], exposures), share)| Self {

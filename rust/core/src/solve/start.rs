@@ -42,8 +42,9 @@ pub(super) fn system<'m, 'a, T: Real>(
     let grid = Grid::of(exposures)?;
     let positions = exposures.positions();
     let shifts = positions.on_grid(&positions.shifts);
-    let kind = exposures.flux_kind();
-    let fluxes = Fluxes::new(exposures.flux(), kind, &shifts, &positions.rotations);
+    let (flux, kind) = (exposures.flux(), exposures.flux_kind());
+    let weights = exposures.exposure_weights(flux);
+    let fluxes = Fluxes::new(flux, kind, &shifts, &positions.rotations, &weights);
     let (state, swept) = match start {
         Some(start) => (moved(start, exposures, &grid, &fluxes, workers, control)?, 0),
         None => {
