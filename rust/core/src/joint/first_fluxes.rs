@@ -10,8 +10,7 @@
 //! The sums are linear in y: noise and unequal pixels average out, and values below 0 count as they are. A ratio
 //! whose fluxes are alike has the variance Σω/(S_kl S_lk), by which ln c is the least-squares solution of all pairs.
 //!
-//! What is affine in the shifts is found too, which the fit leaves to the gauge (`joint/flux.rs`): so the search begins
-//! without the tilt of M that would stand for it.
+//! What is affine in the shifts is found too, which the fit leaves to the gauge (`joint/flux.rs`).
 
 use crate::control::Control;
 use crate::error::Result;

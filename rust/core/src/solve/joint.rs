@@ -61,6 +61,7 @@ pub(super) fn minimise<T: Real>(
     workers: &Workers,
     control: &Control,
 ) -> Result<Found> {
+    let given = exposures.flux();
     let exposures = &start::at_first_fluxes(exposures, start.as_ref(), control)?;
     let needed = joint::bytes_needed(exposures, exposures.flux())?;
     memory::check(Start::bytes_beside(start.as_ref(), needed), || {
@@ -69,7 +70,7 @@ pub(super) fn minimise<T: Real>(
     let mut steps = Steps::new(exposures, options, start, workers, control)?;
     loop {
         if let Some(ended) = steps.next(control)? {
-            return steps.finish(ended, control);
+            return steps.finish(ended, given, control);
         }
     }
 }
@@ -348,8 +349,8 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
         }
     }
 
-    /// What was found, and what the fluxes leave to the gauge.
-    fn finish(mut self, ended: Ended, control: &Control) -> Result<Found> {
+    /// What was found, and what the fluxes leave to the gauge, with those given.
+    fn finish(mut self, ended: Ended, given: &[f64], control: &Control) -> Result<Found> {
         (self.taken, self.course, self.preconditioner) = (None, None, None);
         self.system.free_products();
         let system = &self.system;
@@ -366,8 +367,10 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             degrees_of_freedom(system, &fit, without_offset.len()) + freed.round() as i64;
         let fitted = matches!(exposures.flux_kind(), FluxKind::Free | FluxKind::Linear(_));
         let theta = system.state.theta.first().copied().unwrap_or_default();
+        // The search may have begun at fluxes that have a part affine in the shifts.
+        let (_, _, begun) = system.fluxes.split(given, &system.state.shifts);
         let fluxes = fitted.then(|| FluxGauge {
-            drift: system.fluxes.slope.map(|slope| theta * slope),
+            drift: [0, 1].map(|axis| theta * system.fluxes.slope[axis] - begun[axis]),
             open: system.fluxes.open.clone(),
             rotation: exposures.positions().rotations[0],
             sensor: exposures.sensor(),

@@ -5,7 +5,7 @@ use crate::control::Control;
 use crate::error::Result;
 use crate::exposures::{Exposures, FluxKind};
 use crate::fit::Start;
-use crate::frames::Real;
+use crate::frames::{Real, Shape};
 use crate::geometry::nearest_whole;
 use crate::joint::{Fluxes, Grid, ShiftPrior, Source, State, System, first_beam, first_fluxes};
 use crate::parallel::Workers;
@@ -13,6 +13,9 @@ use crate::reduced::{ConjugateGradients, Whole};
 use crate::sweep::{Estimate, Plain};
 use crate::weak_light::WeakLight;
 
+/// A tilt of ln M from one corner of the sensor to the opposite one that is steep: a factor e, beyond which steps that
+/// are linear in M lead astray.
+const STEEP: f64 = 1.0;
 /// Sweeps that make the first beam.
 const FIRST_SWEEPS: u64 = 4;
 
@@ -56,18 +59,29 @@ pub(super) fn system<'m, 'a, T: Real>(
 }
 
 /// The exposures at the fluxes where the search begins: those given, or free ones of the other fit or of equal pixels.
+///
+/// With the part that is affine in the shifts the search is spared a tilt of M; afterwards it is left to the gauge. A
+/// spline has a penalty, which a tilt of the beam changes: there that part stays as given unless it is steep.
 pub(super) fn at_first_fluxes<'a, T: Real>(
     exposures: &Exposures<'a, T>,
     start: Option<&Start>,
     control: &Control,
 ) -> Result<Exposures<'a, T>> {
-    let first = match (exposures.flux_kind(), start) {
+    let (kind, positions) = (exposures.flux_kind(), exposures.positions());
+    let first = match (kind, start) {
         (FluxKind::Free, Some(start)) => start.flux.clone(),
         // Unknown offsets of pixels would make fluxes seem alike.
         (FluxKind::Free, None) if !exposures.offset() => first_fluxes(exposures, control)?,
-        _ => exposures.flux().to_vec(),
+        _ => return Ok(exposures.clone()),
     };
-    Ok(exposures.at_flux(first))
+    let (weights, rotations) = (exposures.exposure_weights(&first), &positions.rotations);
+    let shifts = positions.on_grid(&positions.shifts);
+    let given = Fluxes::new(exposures.flux(), kind, &shifts, rotations, &weights);
+    let (theta, _, slope) = given.split(&first, &shifts);
+    let Shape { rows, cols } = rotations[0].turned(exposures.sensor());
+    let tilt = slope[0].abs() * rows as f64 + slope[1].abs() * cols as f64;
+    let stays = tilt <= STEEP && Grid::of(exposures)?.is_spline();
+    Ok(exposures.at_flux(if stays { given.at(&theta) } else { first }))
 }
 
 /// The beam after some sweeps.
