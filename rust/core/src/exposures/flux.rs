@@ -6,7 +6,7 @@ use crate::error::{Error, Result};
 /// The flux c of each exposure.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Flux {
-    /// Relative fluxes: as they are, or where the search begins.
+    /// Relative fluxes: as they are, or the first guess.
     pub values: Vec<f64>,
     /// What is known of them.
     pub kind: FluxKind,

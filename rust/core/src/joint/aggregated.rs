@@ -291,10 +291,10 @@ mod tests {
             let flux = vec![1.0, 0.7, 1.6, 0.4, 1.2];
             let lamp = Flux { values: flux.clone(), kind: FluxKind::Known };
             let positions = Positions::of_shifts(&SHIFTS);
-            let fluxes = Fluxes::new(&flux, &FluxKind::Known, &SHIFTS, &positions.rotations, &flux);
             let exposures =
                 Exposures::new(measurements, positions, lamp, false, &workers, &control).unwrap();
             let grid = Grid::of(&exposures).unwrap();
+            let fluxes = Fluxes::of(&exposures, &flux, &SHIFTS, &grid);
             let beam = (0..grid.geometry.beam.len()).map(|cell| positive(cell + 4321)).collect();
             let state = State { beam, theta: Vec::new(), shifts: SHIFTS.to_vec() };
             let mut system =

@@ -146,6 +146,7 @@ mod tests {
     const SENSOR: Shape = Shape::new(40, 40);
     const SHIFTS: [[f64; 2]; 5] =
         [[0.0, 0.0], [7.0, -12.0], [-9.0, 5.0], [3.0, 16.0], [-4.2, -1.7]];
+    const UNTURNED: [Rotation; 5] = [Rotation::None; 5];
     const TURNED: [Rotation; 5] = [
         Rotation::None,
         Rotation::Quarter,
@@ -153,46 +154,80 @@ mod tests {
         Rotation::ThreeQuarters,
         Rotation::None,
     ];
+    const LAMP: [f64; 5] = [1.0, 0.1, 2.0, 0.3, 7.0];
+    const STD: f64 = 1e-3;
 
-    /// Those of exposures that a lamp of these fluxes made of a beam with a slope; every third value of the first is
-    /// masked.
-    fn found(flux: &[f64], rotations: [Rotation; 5]) -> Vec<f64> {
+    /// Those of exposures that a lamp made of a beam with a slope, with noise of these standard deviations. Every third
+    /// value of the first is masked, and some of the others are none.
+    fn found(shifts: &[[f64; 2]], rotations: &[Rotation], given: &[f64], std: &[f64]) -> Vec<f64> {
         let (workers, control) = (Workers::new(None).unwrap(), Control::new());
+        let count = shifts.len();
         let positions =
-            Positions { shifts: SHIFTS.to_vec(), rotations: rotations.to_vec(), std: None };
+            Positions { shifts: shifts.to_vec(), rotations: rotations.to_vec(), std: None };
         let mut frames = Vec::new();
-        for (k, c) in flux.iter().enumerate() {
+        for k in 0..count {
             for pixel in 0..SENSOR.len() {
                 let place = [pixel / SENSOR.cols, pixel % SENSOR.cols].map(|at| at as f64);
                 let [row, col] = rotations[k].to_beam(place, SENSOR);
-                let [row, col] = [row + SHIFTS[k][0], col + SHIFTS[k][1]];
+                let [row, col] = [row + shifts[k][0], col + shifts[k][1]];
                 let m = 1.0 + 0.05 * random_number(pixel);
-                frames.push(c * m * (1.0 + 0.01 * row + 0.1 * (col / 9.0).sin()));
+                let light = LAMP[k] * m * (1.0 + 0.01 * row + 0.1 * (col / 9.0).sin());
+                // Of variance 1: uniform numbers have 1/3.
+                let noise = 3.0_f64.sqrt() * random_number(frames.len() + 7000);
+                frames.push(light + std[k] * noise);
             }
         }
         let masked: Vec<bool> =
             (0..frames.len()).map(|at| at < SENSOR.len() && at % 3 == 0).collect();
-        let stack = Stack::new("frames", &frames[..], flux.len(), SENSOR).unwrap();
+        frames.iter_mut().skip(SENSOR.len()).step_by(97).for_each(|value| *value = f64::NAN);
+        let variances: Vec<f64> = std.iter().map(|std| std * std).collect();
         let measurements = Measurements {
-            frames: stack,
-            variance: Variance::Unknown,
+            frames: Stack::new("frames", &frames[..], count, SENSOR).unwrap(),
+            variance: Variance::Exposures(&variances),
             mask: Mask::Measurements(&masked),
         };
-        let lamp = Flux { values: vec![1.0; flux.len()], kind: FluxKind::Free };
+        let lamp = Flux { values: given.to_vec(), kind: FluxKind::Free };
         let exposures =
             Exposures::new(measurements, positions, lamp, false, &workers, &control).unwrap();
         first_fluxes(&exposures, &control).unwrap()
     }
 
+    /// Whether all fluxes but `except` are those of the lamp: M scatters by 3 % over some 500 pixels of each of two
+    /// exposures, and the beam changes by 1 % over 0.3 cells.
+    fn are_those_of_the_lamp(found: &[f64], except: Option<usize>) -> bool {
+        let off = |k: usize| (found[k] / found[0] / LAMP[k]).ln().abs();
+        (0..found.len()).filter(|k| Some(*k) != except).all(|k| off(k) < 0.01)
+    }
+
     #[test]
-    fn they_are_those_of_the_lamp() {
-        let flux = [1.0, 0.1, 2.0, 0.3, 7.0];
-        for rotations in [[Rotation::None; 5], TURNED] {
-            let found = found(&flux, rotations);
-            for (c, wanted) in found.iter().map(|c| c / found[0]).zip(&flux) {
-                // A scatter of M of 3 % over some 500 pixels, of two exposures each, and 0.3 cells of the beam.
-                assert!((c / wanted - 1.0).abs() < 0.01, "{c} {wanted}");
+    fn they_are_those_of_the_lamp_whatever_was_given() {
+        for rotations in [UNTURNED, TURNED] {
+            for given in [[1.0; 5], [4.0, 1.0, 0.2, 1.0, 30.0]] {
+                let found = found(&SHIFTS, &rotations, &given, &[STD; 5]);
+                assert!(are_those_of_the_lamp(&found, None), "{found:?}");
             }
         }
+    }
+
+    #[test]
+    fn noise_above_the_light_moves_one_flux_as_far_as_it_must() {
+        for (noisy, times) in [(1, 3.0), (4, 3.0), (4, 10.0)] {
+            let mut std = [STD; 5];
+            std[noisy] = times * LAMP[noisy];
+            let found = found(&SHIFTS, &UNTURNED, &[1.0; 5], &std);
+            assert!(are_those_of_the_lamp(&found, Some(noisy)), "{found:?}");
+            // The mean of 1000 pixels that others see too, whose light is 1.2 of the lamp's; three standard deviations.
+            let off = (found[noisy] / found[0] / LAMP[noisy]).ln().abs();
+            assert!(off < 3.0 * times / 1.2 / 1000.0_f64.sqrt(), "{off}");
+        }
+    }
+
+    #[test]
+    fn a_flux_that_no_common_cell_determines_stays_as_given() {
+        // One sees cells of none of the others.
+        let shifts = [[-20.0, 0.0], [-18.0, 3.0], [22.0, 3.0]];
+        let found = found(&shifts, &UNTURNED[..3], &[1.0, 1.0, 5.0], &[STD; 3]);
+        assert!((found[1] / found[0] / LAMP[1] - 1.0).abs() < 0.01);
+        assert_eq!(found[2], 5.0);
     }
 }

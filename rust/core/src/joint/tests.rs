@@ -88,7 +88,7 @@ fn with_system(
     let exposures =
         Exposures::new(measurements, positions, lamp, false, &workers, &control).unwrap();
     let grid = Grid::of(&exposures).unwrap();
-    let fluxes = Fluxes::new(&FLUX, &kind, shifts, &rotations, &exposures.exposure_weights(&FLUX));
+    let fluxes = Fluxes::of(&exposures, &FLUX, shifts, &grid);
     let beam = (0..grid.geometry.beam.len()).map(|cell| 1.0 + 0.1 * random(cell + 300)).collect();
     let state = State { beam, theta: vec![0.0; fluxes.columns.len()], shifts: shifts.to_vec() };
     let mut system = System::new(&exposures, grid, fluxes, state, &workers, &control).unwrap();
@@ -306,7 +306,7 @@ fn the_matrix_of_waves_is_that_of_the_product() {
         Exposures::new(frames.into(), positions, Flux::steady(3), false, &workers, &control);
     let exposures = exposures.unwrap();
     let grid = Grid::new(sensor, &shifts, &[Rotation::None; 3], false).unwrap();
-    let fluxes = Fluxes::new(&[1.0; 3], &FluxKind::Known, &shifts, &[Rotation::None; 3], &[1.0; 3]);
+    let fluxes = Fluxes::of(&exposures, &[1.0; 3], &shifts, &grid);
     let state = State {
         beam: vec![1.0; grid.geometry.beam.len()],
         theta: Vec::new(),

@@ -45,9 +45,7 @@ pub(super) fn system<'m, 'a, T: Real>(
     let grid = Grid::of(exposures)?;
     let positions = exposures.positions();
     let shifts = positions.on_grid(&positions.shifts);
-    let (flux, kind) = (exposures.flux(), exposures.flux_kind());
-    let weights = exposures.exposure_weights(flux);
-    let fluxes = Fluxes::new(flux, kind, &shifts, &positions.rotations, &weights);
+    let fluxes = Fluxes::of(exposures, exposures.flux(), &shifts, &grid);
     let (state, swept) = match start {
         Some(start) => (moved(start, exposures, &grid, &fluxes, workers, control)?, 0),
         None => {
@@ -67,20 +65,19 @@ pub(super) fn at_first_fluxes<'a, T: Real>(
     start: Option<&Start>,
     control: &Control,
 ) -> Result<Exposures<'a, T>> {
-    let (kind, positions) = (exposures.flux_kind(), exposures.positions());
-    let first = match (kind, start) {
+    let positions = exposures.positions();
+    let first = match (exposures.flux_kind(), start) {
         (FluxKind::Free, Some(start)) => start.flux.clone(),
         // Unknown offsets of pixels would make fluxes seem alike.
         (FluxKind::Free, None) if !exposures.offset() => first_fluxes(exposures, control)?,
         _ => return Ok(exposures.clone()),
     };
-    let (weights, rotations) = (exposures.exposure_weights(&first), &positions.rotations);
-    let shifts = positions.on_grid(&positions.shifts);
-    let given = Fluxes::new(exposures.flux(), kind, &shifts, rotations, &weights);
+    let (grid, shifts) = (Grid::of(exposures)?, positions.on_grid(&positions.shifts));
+    let given = Fluxes::of(exposures, exposures.flux(), &shifts, &grid);
     let (theta, _, slope) = given.split(&first, &shifts);
-    let Shape { rows, cols } = rotations[0].turned(exposures.sensor());
+    let Shape { rows, cols } = positions.rotations[0].turned(exposures.sensor());
     let tilt = slope[0].abs() * rows as f64 + slope[1].abs() * cols as f64;
-    let stays = tilt <= STEEP && Grid::of(exposures)?.is_spline();
+    let stays = tilt <= STEEP && grid.is_spline();
     Ok(exposures.at_flux(if stays { given.at(&theta) } else { first }))
 }
 

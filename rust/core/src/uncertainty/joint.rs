@@ -535,9 +535,7 @@ fn problem<'m, 'a, T: Real>(
 ) -> Result<System<'m, 'a, T>> {
     let (grid, positions) = (Grid::of(exposures)?, exposures.positions());
     let shifts = positions.on_grid(solution.shifts);
-    let kind = exposures.flux_kind();
-    let weights = exposures.exposure_weights(solution.flux);
-    let fluxes = Fluxes::new(solution.flux, kind, &shifts, &positions.rotations, &weights);
+    let fluxes = Fluxes::of(exposures, solution.flux, &shifts, &grid);
     let beam = solution.beam.coefficients.unwrap_or(solution.beam.values);
     let known = |value: &f64| if value.is_finite() { *value } else { 0.0 };
     let state = State {
