@@ -37,8 +37,9 @@ def test_a_lamp_may_vary_by_a_factor_of_ten(flux, fraction):
     given = equipix.calibrate(frames, shifts, flux=flux, variance=variance, uncertainty=False)
     assert free.converged
     off, least = (error_without_tilt(one.sensitivity, truth) for one in (free, given))
-    # Two combinations of fluxes are two of 4320 unknowns.
-    assert off == pytest.approx(least, rel=0.01)
+    # Two combinations of fluxes beside 4320 pixels. Squares rise by χ² of 2 degrees, below 14 in 999 of 1000 cases, times
+    # the variance of bends across the sensor, up to (72/19)² that of a pixel.
+    assert off == pytest.approx(least, rel=0.5 * 14 * (72 / 19) ** 2 / 4320)
 
 
 def error_without_tilt(sensitivity, truth):
@@ -47,6 +48,7 @@ def error_without_tilt(sensitivity, truth):
     return (off - tilts @ np.linalg.lstsq(tilts, off, rcond=None)[0]).std()
 
 
+# One exposure of a hundredth of the weight tells little of how it is turned.
 @pytest.mark.filterwarnings("ignore:.*determine the orientation")
 @pytest.mark.parametrize(
     ("lamp", "light"), [("turned", [1, 1, 1, 1, 1, 1e-2]), ("linear", [1e-2, 1e-2, 1, 1, 1, 1])]
@@ -70,8 +72,9 @@ def test_a_tilt_that_little_light_determines_has_its_standard_deviation(lamp, li
     calibration = equipix.calibrate(frames, FAR, variance=variance, uncertainty=True, **options)
     assert calibration.converged
     wanted = tilt_std(exact, FAR, rotation, variance, columns)
-    # The problem at what was found is that of the truth but for noise, here 1 % of a value.
-    assert calibration.tilt_std == pytest.approx(wanted, rel=0.01)
+    # The problem at what was found is that of the truth but for noise of 1 % of a value: 1e-4 by its square, and twice
+    # as much as its mean over 2688 pixels.
+    assert calibration.tilt_std == pytest.approx(wanted, rel=1e-3)
 
 
 def tilt_std(exact, shifts, rotation, variance, columns):

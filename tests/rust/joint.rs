@@ -259,6 +259,7 @@ fn free_fluxes_may_be_far_from_those_given() {
         assert!(near.converged && far.converged, "{:?}", far.history.last());
         // A tilt of the beam changes the penalty: M differs by no more than the penalty moves it.
         let Minimum { of_penalty, .. } = Minimum::beside(&known, &near, TOLERANCE).unwrap();
+        assert!(of_penalty < 1e-3, "above the noise");
         let most = of_penalty + 2.0 * allowed(&simulation);
         let off = apart(&far.sensitivity, &near.sensitivity);
         assert!(off <= most, "{off:e} above {most:e}");
