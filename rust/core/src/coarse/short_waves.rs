@@ -14,7 +14,7 @@ use crate::geometry::Placement;
 /// Of more waves that are barely constrained the deepest four are too few, and aggregates see them all.
 const MANY: f64 = 150.0;
 
-/// Bytes of aggregates for each pixel above which they take longer than they save: of 8 positions, two of
+/// Bytes of aggregates for each unknown above which they take longer than they save: of 8 positions, two of
 /// which had 1e4 times the weight of the others, 450 bytes and twice the time; of 20, 2400 and 14 times.
 const MOST_BYTES: usize = 250;
 

@@ -42,7 +42,7 @@ impl Aggregated {
         control: &Control,
     ) -> Result<Option<Self>> {
         let Pass { exposures, flux, grid, .. } = &system.pass;
-        if bytes_needed(exposures, flux, grid).is_none() {
+        if in_place_of_waves(exposures, flux, grid).is_none() {
             return Ok(None);
         }
         let workers = system.pass.workers;
@@ -86,22 +86,33 @@ impl Aggregated {
     }
 }
 
-/// What aggregates take in bytes where they stand for the waves of these exposures, with what their matrix is summed
-/// from: `None` where waves are fewer at these fluxes, where the beam is a spline, or its views are turned.
-pub(super) fn bytes_needed<T: Real>(
+/// Bytes for each cell of the aggregates that stand for the waves of these exposures, and their places: `None` where
+/// waves are fewer at these fluxes, where the beam is a spline, or its views are turned.
+pub(super) fn in_place_of_waves<T: Real>(
     exposures: &Exposures<'_, T>,
     flux: &[f64],
     grid: &Grid,
-) -> Option<u64> {
+) -> Option<[usize; 2]> {
     let is_turned = grid.geometry.views.iter().any(|view| view.rotation != Rotation::None);
     if is_turned || grid.is_spline() {
         return None;
     }
-    let ShortWaves::Aggregates { bytes, places } = ShortWaves::of(exposures, flux) else {
-        return None;
-    };
-    let of_pixel = size_of::<f32>() * (places + 1);
-    Some((bytes * grid.geometry.beam.len() + of_pixel * grid.sensor.len()) as u64)
+    match ShortWaves::of(exposures, flux) {
+        ShortWaves::Aggregates { bytes, places } => Some([bytes, places]),
+        ShortWaves::Waves(_) => None,
+    }
+}
+
+/// What aggregates take in bytes, with what their matrix is summed from; 0 where there are none.
+pub(super) fn bytes_needed<T: Real>(
+    exposures: &Exposures<'_, T>,
+    flux: &[f64],
+    grid: &Grid,
+) -> u64 {
+    in_place_of_waves(exposures, flux, grid).map_or(0, |[bytes, places]| {
+        let of_pixel = size_of::<f32>() * (places + 1);
+        (bytes * grid.geometry.beam.len() + of_pixel * grid.sensor.len()) as u64
+    })
 }
 
 /// Cells, compared by the pixels that see them.

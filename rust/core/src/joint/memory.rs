@@ -34,7 +34,7 @@ pub(crate) fn bytes_needed<T: Real>(exposures: &Exposures<'_, T>, flux: &[f64]) 
     let shifts = positions.on_grid(&positions.shifts);
     let fitted = positions.std.is_some();
     let grid = Grid::of(exposures)?;
-    let of_aggregates = aggregated::bytes_needed(exposures, flux, &grid).unwrap_or(0);
+    let of_aggregates = aggregated::bytes_needed(exposures, flux, &grid);
     Ok(bytes_of(&grid, &shifts, fitted, exposures.offset()) + of_aggregates)
 }
 
