@@ -47,8 +47,9 @@ pub(crate) fn fix_means(fit: &mut Fit, left_out: &[usize], workers: &Workers) {
 
 /// What fitted fluxes leave to the gauge.
 pub(crate) struct FluxGauge {
-    /// The slope of ln L that a lamp's drift has in the beam.
-    pub(crate) drift: [f64; 2],
+    /// The slope of ln c along the shifts that the search left out or began with, by a lamp's drift or by free fluxes:
+    /// which pixels count for the slope of ln M is decided by M at the fluxes given.
+    pub(crate) slope: [f64; 2],
     /// The directions in the beam along which a tilt is left undetermined.
     pub(crate) open: Vec<[f64; 2]>,
     /// How the sensor was turned in the first exposure.
@@ -56,11 +57,11 @@ pub(crate) struct FluxGauge {
     pub(crate) sensor: Shape,
 }
 
-/// Gives L the slope of the drift, brings the mean of ln c to 0, and the slope of ln M to 0 along the open
+/// Gives L that slope, brings the mean of ln c to 0, and the slope of ln M to 0 along the open
 /// directions; needs the flags.
 pub(crate) fn fix_fluxes(fit: &mut Fit, gauge: &FluxGauge) {
-    let FluxGauge { drift, open, rotation, sensor } = gauge;
-    untilt(fit, rotation.in_sensor(*drift), *rotation, *sensor);
+    let FluxGauge { slope, open, rotation, sensor } = gauge;
+    untilt(fit, rotation.in_sensor(*slope), *rotation, *sensor);
     if !open.is_empty() {
         level(fit, gauge);
     }

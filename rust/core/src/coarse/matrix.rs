@@ -23,8 +23,8 @@ pub(super) const NOTHING: f64 = 1e-10;
 /// square of the nodes along a side: a tenth of the smallest eigenvalue of a sensor that hangs
 /// together. Single precision leaves errors in those directions, which must not be magnified.
 const SINGULAR_RIDGE: f64 = 0.3;
-/// Blocks between two looks at whether to stop.
-const CHECK_EVERY: usize = 1 << 12;
+/// Squares of the exposures of blocks between two looks at whether to stop.
+const CHECK_EVERY: usize = 1 << 17;
 /// Enough for eigenvalues that stand so far apart.
 const INVERSE_ITERATIONS: usize = 3;
 
@@ -46,10 +46,13 @@ impl Coarse {
         control: &Control,
     ) -> Result<Self> {
         let mut matrix = Matrix::new(hats, others.len());
-        for (index, entries) in blocks.enumerate() {
-            if index % CHECK_EVERY == 0 {
+        let mut unchecked = CHECK_EVERY;
+        for entries in blocks {
+            if unchecked >= CHECK_EVERY {
                 control.check()?;
+                unchecked = 0;
             }
+            unchecked += entries.len().pow(2);
             matrix.add_block(&entries);
         }
         let of_hats = own.iter().enumerate();
@@ -191,14 +194,21 @@ impl Matrix {
                 mean[at] += entry.weight / total * height;
             }
         }
+        // Summed before it is added: an element may be one of a map.
+        let mut sums = vec![0.0; nodes.len() * nodes.len()];
         for (entry, heights) in entries.iter().zip(heights.chunks_exact_mut(nodes.len().max(1))) {
             for (height, mean) in heights.iter_mut().zip(&mean) {
                 *height -= mean;
             }
-            for (a, &upper) in nodes.iter().enumerate() {
-                for (b, &lower) in nodes.iter().enumerate().skip(a) {
-                    self.add(upper, lower, entry.weight * heights[a] * heights[b]);
-                }
+            for (a, sums) in sums.chunks_exact_mut(nodes.len().max(1)).enumerate() {
+                let upper = entry.weight * heights[a];
+                let lower = sums[a..].iter_mut().zip(&heights[a..]);
+                lower.for_each(|(sum, height)| *sum += upper * height);
+            }
+        }
+        for (a, &upper) in nodes.iter().enumerate() {
+            for (b, &lower) in nodes.iter().enumerate().skip(a) {
+                self.add(upper, lower, sums[a * nodes.len() + b]);
             }
         }
     }

@@ -225,8 +225,7 @@ impl<'a, T: Real> Exposures<'a, T> {
     }
 
     /// The weight that each exposure has in all at these fluxes: Σ_p w c².
-    #[must_use]
-    pub fn exposure_weights(&self, flux: &[f64]) -> Vec<f64> {
+    pub(crate) fn exposure_weights(&self, flux: &[f64]) -> Vec<f64> {
         let tallies = self.checked.tallies.iter().zip(flux);
         tallies.map(|(tally, c)| tally.weight * c * c).collect()
     }

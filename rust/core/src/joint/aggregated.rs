@@ -41,8 +41,9 @@ impl Aggregated {
         system: &mut System<'_, '_, T>,
         control: &Control,
     ) -> Result<Option<Self>> {
-        let Pass { exposures, flux, grid, .. } = &system.pass;
-        if in_place_of_waves(exposures, flux, grid).is_none() {
+        let Pass { exposures, grid, .. } = &system.pass;
+        // As memory was asked for.
+        if in_place_of_waves(exposures, &system.fluxes.values, grid).is_none() {
             return Ok(None);
         }
         let workers = system.pass.workers;

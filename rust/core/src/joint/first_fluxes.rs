@@ -7,8 +7,9 @@
 //! ln c_k − ln c_l = ln (S_kl/S_lk),   S_kl = Σ_u ω y_k,   ω = w_k w_l/(w_k + w_l)
 //! ```
 //!
-//! The sums are linear in y: noise and unequal pixels average out, and values below 0 count as they are. A ratio
-//! whose fluxes are alike has the variance Σω/(S_kl S_lk), by which ln c is the least-squares solution of all pairs.
+//! with y in units of the flux given, and w that goes with it. The sums are linear in y: noise and unequal pixels
+//! average out, and values below 0 count as they are. The logarithm of such a ratio has the variance Σω/(S_kl S_lk) if
+//! the fluxes given are nearly right; by these ln c is the least-squares solution of all pairs with light.
 //!
 //! What is affine in the shifts is found too, which the fit leaves to the gauge (`joint/flux.rs`).
 
@@ -23,7 +24,7 @@ use crate::linalg::Cholesky;
 const MOST_CELLS: usize = 1 << 18;
 /// Upper limit on the pairs of measurements of a cell that are summed.
 const MOST_PAIRS: usize = 1 << 28;
-/// Added to the diagonal, as a share of itself: a common factor stays as given.
+/// Added to the diagonal, as a share of itself: a factor common to exposures that no others are tied to stays as given.
 const RIDGE: f64 = 1e-12;
 
 /// What one exposure measured of a cell.
@@ -52,7 +53,7 @@ pub(crate) fn first_fluxes<T: Real>(
     control: &Control,
 ) -> Result<Vec<f64>> {
     let count = exposures.count();
-    let mut pairs = vec![vec![Pair::default(); count]; count];
+    let mut pairs: Vec<_> = (0..count).map(|others| vec![Pair::default(); others]).collect();
     for_each_cell(exposures, control, |cell| {
         for (index, one) in cell.iter().enumerate() {
             for other in &cell[..index] {
@@ -160,18 +161,15 @@ mod tests {
     /// Those of exposures that a lamp made of a beam with a slope, with noise of these standard deviations. Every third
     /// value of the first is masked, and some of the others are none.
     fn found(shifts: &[[f64; 2]], rotations: &[Rotation], given: &[f64], std: &[f64]) -> Vec<f64> {
-        let (workers, control) = (Workers::new(None).unwrap(), Control::new());
-        let count = shifts.len();
-        let positions =
-            Positions { shifts: shifts.to_vec(), rotations: rotations.to_vec(), std: None };
         let mut frames = Vec::new();
-        for k in 0..count {
+        for (k, shift) in shifts.iter().enumerate() {
             for pixel in 0..SENSOR.len() {
                 let place = [pixel / SENSOR.cols, pixel % SENSOR.cols].map(|at| at as f64);
                 let [row, col] = rotations[k].to_beam(place, SENSOR);
-                let [row, col] = [row + shifts[k][0], col + shifts[k][1]];
+                let [row, col] = [row + shift[0], col + shift[1]];
                 let m = 1.0 + 0.05 * random_number(pixel);
-                let light = LAMP[k] * m * (1.0 + 0.01 * row + 0.1 * (col / 9.0).sin());
+                // Above 1 all over the beam.
+                let light = LAMP[k] * m * (1.4 + 0.01 * row + 0.1 * (col / 9.0).sin());
                 // Of variance 1: uniform numbers have 1/3.
                 let noise = 3.0_f64.sqrt() * random_number(frames.len() + 7000);
                 frames.push(light + std[k] * noise);
@@ -180,12 +178,24 @@ mod tests {
         let masked: Vec<bool> =
             (0..frames.len()).map(|at| at < SENSOR.len() && at % 3 == 0).collect();
         frames.iter_mut().skip(SENSOR.len()).step_by(97).for_each(|value| *value = f64::NAN);
+        of_frames(&frames, SENSOR, shifts, rotations, given, std, Mask::Measurements(&masked))
+    }
+
+    fn of_frames(
+        frames: &[f64],
+        sensor: Shape,
+        shifts: &[[f64; 2]],
+        rotations: &[Rotation],
+        given: &[f64],
+        std: &[f64],
+        mask: Mask<'_>,
+    ) -> Vec<f64> {
+        let (workers, control) = (Workers::new(None).unwrap(), Control::new());
         let variances: Vec<f64> = std.iter().map(|std| std * std).collect();
-        let measurements = Measurements {
-            frames: Stack::new("frames", &frames[..], count, SENSOR).unwrap(),
-            variance: Variance::Exposures(&variances),
-            mask: Mask::Measurements(&masked),
-        };
+        let frames = Stack::new("frames", frames, shifts.len(), sensor).unwrap();
+        let measurements = Measurements { frames, variance: Variance::Exposures(&variances), mask };
+        let positions =
+            Positions { shifts: shifts.to_vec(), rotations: rotations.to_vec(), std: None };
         let lamp = Flux { values: given.to_vec(), kind: FluxKind::Free };
         let exposures =
             Exposures::new(measurements, positions, lamp, false, &workers, &control).unwrap();
@@ -216,18 +226,53 @@ mod tests {
             std[noisy] = times * LAMP[noisy];
             let found = found(&SHIFTS, &UNTURNED, &[1.0; 5], &std);
             assert!(are_those_of_the_lamp(&found, Some(noisy)), "{found:?}");
-            // The mean of 1000 pixels that others see too, whose light is 1.2 of the lamp's; three standard deviations.
+            // Its light is above the lamp's, and others see at least 28 times 24 of its pixels: three standard deviations.
             let off = (found[noisy] / found[0] / LAMP[noisy]).ln().abs();
-            assert!(off < 3.0 * times / 1.2 / 1000.0_f64.sqrt(), "{off}");
+            assert!(off < 3.0 * times / (28.0_f64 * 24.0).sqrt(), "{off}");
         }
     }
 
     #[test]
-    fn a_flux_that_no_common_cell_determines_stays_as_given() {
-        // One sees cells of none of the others.
-        let shifts = [[-20.0, 0.0], [-18.0, 3.0], [22.0, 3.0]];
-        let found = found(&shifts, &UNTURNED[..3], &[1.0, 1.0, 5.0], &[STD; 3]);
-        assert!((found[1] / found[0] / LAMP[1] - 1.0).abs() < 0.01);
-        assert_eq!(found[2], 5.0);
+    fn exposures_without_light_in_common_stay_as_given() {
+        // Most values are above 0, and those below outweigh them.
+        let dark = |pixel: usize| if pixel % 5 < 3 { 0.01 } else { -0.1 };
+        let frames: Vec<f64> =
+            (0..2 * 1600).map(|at| if at < 1600 { 1.0 } else { dark(at) }).collect();
+        let shifts = [[0.0, 0.0], [3.0, 5.0]];
+        let of = |frames: &[f64]| {
+            of_frames(frames, SENSOR, &shifts, &UNTURNED[..2], &[1.0, 0.3], &[1.0; 2], Mask::None)
+        };
+        assert_eq!(of(&frames), [1.0, 0.3]);
+    }
+
+    #[test]
+    fn all_colours_of_a_filter_array_count_on_a_large_sensor() {
+        let sensor = Shape::new(600, 602);
+        assert!(sensor.len() > MOST_CELLS);
+        let colour = |pixel: usize| {
+            if (pixel / sensor.cols + pixel % sensor.cols).is_multiple_of(2) { 1.0 } else { 0.2 }
+        };
+        let frames: Vec<f64> =
+            (0..2).flat_map(|k| (0..sensor.len()).map(move |at| LAMP[k] * colour(at))).collect();
+        let shifts = [[0.0, 0.0], [1.0, 0.0]];
+        let found =
+            of_frames(&frames, sensor, &shifts, &UNTURNED[..2], &[1.0; 2], &[1.0; 2], Mask::None);
+        // One row more of one colour than of the other, of the 200 that are looked at.
+        assert!((found[1] / found[0] / LAMP[1]).ln().abs() < 1.0 / 200.0, "{found:?}");
+    }
+
+    #[test]
+    fn what_no_common_cell_determines_stays_as_given() {
+        // Two pairs that see no cell of each other.
+        let shifts = [[-20.0, 0.0], [-18.0, 3.0], [22.0, 3.0], [25.0, 1.0]];
+        let given = [1.0, 1.0, 4.0, 4.0];
+        let found = found(&shifts, &UNTURNED[..4], &given, &[STD; 4]);
+        for [one, other] in [[0, 1], [2, 3]] {
+            let ratio = found[other] / found[one] / (LAMP[other] / LAMP[one]);
+            assert!((ratio - 1.0).abs() < 0.02, "{found:?}");
+            // Of both the weights are alike.
+            let both = found[one] * found[other] / (given[one] * given[other]);
+            assert!((both - 1.0).abs() < 0.02, "{found:?}");
+        }
     }
 }

@@ -367,10 +367,14 @@ impl<'m, 'a, T: Real> Steps<'m, 'a, T> {
             degrees_of_freedom(system, &fit, without_offset.len()) + freed.round() as i64;
         let fitted = matches!(exposures.flux_kind(), FluxKind::Free | FluxKind::Linear(_));
         let theta = system.state.theta.first().copied().unwrap_or_default();
-        // The search may have begun at fluxes that have a part affine in the shifts.
-        let (_, _, begun) = system.fluxes.split(given, &system.state.shifts);
+        // Where exposures are turned against each other the slope of ln c is determined.
+        let begun = if system.fluxes.open.is_empty() {
+            [0.0; 2]
+        } else {
+            system.fluxes.split(given, &system.state.shifts).2
+        };
         let fluxes = fitted.then(|| FluxGauge {
-            drift: [0, 1].map(|axis| theta * system.fluxes.slope[axis] - begun[axis]),
+            slope: [0, 1].map(|axis| theta * system.fluxes.slope[axis] - begun[axis]),
             open: system.fluxes.open.clone(),
             rotation: exposures.positions().rotations[0],
             sensor: exposures.sensor(),

@@ -58,8 +58,9 @@ pub(super) fn system<'m, 'a, T: Real>(
 
 /// The exposures at the fluxes where the search begins: those given, or free ones of the other fit or of equal pixels.
 ///
-/// With the part that is affine in the shifts the search is spared a tilt of M; afterwards it is left to the gauge. A
-/// spline has a penalty, which a tilt of the beam changes: there that part stays as given unless it is steep.
+/// With the part that is affine in the shifts the search is spared a tilt of M, which the result gets back before the
+/// gauge is fixed. A spline has a penalty, which a tilt of the beam changes: there that part stays as given unless it is
+/// steep.
 pub(super) fn at_first_fluxes<'a, T: Real>(
     exposures: &Exposures<'a, T>,
     start: Option<&Start>,
@@ -73,12 +74,14 @@ pub(super) fn at_first_fluxes<'a, T: Real>(
         _ => return Ok(exposures.clone()),
     };
     let (grid, shifts) = (Grid::of(exposures)?, positions.on_grid(&positions.shifts));
+    if !grid.is_spline() {
+        return Ok(exposures.at_flux(first));
+    }
     let given = Fluxes::of(exposures, exposures.flux(), &shifts, &grid);
     let (theta, _, slope) = given.split(&first, &shifts);
     let Shape { rows, cols } = positions.rotations[0].turned(exposures.sensor());
     let tilt = slope[0].abs() * rows as f64 + slope[1].abs() * cols as f64;
-    let stays = tilt <= STEEP && grid.is_spline();
-    Ok(exposures.at_flux(if stays { given.at(&theta) } else { first }))
+    Ok(exposures.at_flux(if tilt > STEEP { first } else { given.at(&theta) }))
 }
 
 /// The beam after some sweeps.
