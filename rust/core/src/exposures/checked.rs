@@ -237,6 +237,13 @@ impl<'a, T: Real> Exposures<'a, T> {
         weights.iter().map(|weight| weight / total).collect()
     }
 
+    /// The eigenvalue of a pattern that the exposure of least weight alone determines, in units of what it would be
+    /// with equal weights.
+    pub(crate) fn least_eigenvalue(&self, flux: &[f64]) -> f64 {
+        let least = self.shares(flux).into_iter().fold(1.0, f64::min);
+        self.count() as f64 * least
+    }
+
     /// Calls `visit(pixel, cell)` for each used measurement.
     ///
     /// # Errors

@@ -21,7 +21,14 @@ pub(crate) struct Known {
 
 impl Default for Known {
     fn default() -> Self {
-        Self { lowest: Lowest::new(DAMPING), iterations: 0 }
+        Self::with(1.0)
+    }
+}
+
+impl Known {
+    /// With an eigenvalue that is so much smaller than that of smooth errors.
+    pub(crate) fn with(smaller: f64) -> Self {
+        Self { lowest: Lowest::new(DAMPING * smaller), iterations: 0 }
     }
 }
 

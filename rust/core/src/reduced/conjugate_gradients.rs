@@ -265,13 +265,18 @@ pub(crate) struct Smallest {
 }
 
 impl Default for Smallest {
-    /// The eigenvalue of smooth errors, known beforehand.
     fn default() -> Self {
-        Self { lowest: Lowest::new(DAMPING), iterations: 0, settled: false, stuck: false }
+        Self::with(1.0)
     }
 }
 
 impl Smallest {
+    /// With the eigenvalue of smooth errors, known beforehand, or one that is so much smaller.
+    pub(crate) fn with(smaller: f64) -> Self {
+        let lowest = Lowest::new(DAMPING * smaller);
+        Self { lowest, iterations: 0, settled: false, stuck: false }
+    }
+
     /// One more iteration of `search`; `false` if there was none to make.
     pub(crate) fn iterate<T: Real>(
         &mut self,

@@ -69,6 +69,8 @@ pub(super) struct JointCovariance<'m, 'a, T> {
     preconditioner: Preconditioner,
     /// What searches of one question have told.
     known: Known,
+    /// What an eigenvalue may be without a draw that shows it: its part in the residual is as small.
+    least: f64,
     /// S⁻¹ b of the last right-hand side b, and b · S⁻¹ b.
     x: Vec<f64>,
     energy: f64,
@@ -118,12 +120,14 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             .map(|(determined, flags)| *determined && flags & flag::UNRELIABLE_FLAT == 0)
             .collect();
         let (valid, scale) = valid(&system, &counted);
+        let least = exposures.least_eigenvalue(solution.flux);
         Ok(Self {
             tilts: OnceCell::new(),
             solution: solution.clone(),
             system,
             preconditioner,
-            known: Known::default(),
+            known: Known::with(least),
+            least,
             x: Vec::new(),
             energy: 0.0,
             considered,
@@ -152,7 +156,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
     /// What the noise of the dark adds to F, on average; 0 without a dark.
     pub(super) fn misfit_by_dark(&mut self, control: &Control) -> Result<f64> {
         let Some(left) = self.dark.as_ref().map(|dark| dark.left) else { return Ok(0.0) };
-        self.known = Known::default();
+        self.known = Known::with(self.least);
         let propagated = mean_misfit(count(&self.valid), |draw| {
             let slope = self.pulls_of_noise(draw, false, control)?;
             self.apply_inverse(slope, LACK_OF_FUNCTIONAL, control)?;
@@ -163,7 +167,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
 
     /// The standard deviation of M by pixel, in units of that of a value of weight 1.
     pub(super) fn error_map(&mut self, control: &Control) -> Result<ErrorMap> {
-        self.known = Known::default();
+        self.known = Known::with(self.least);
         let tilts = self.tilts();
         if let Some(dark) = &mut self.dark {
             let propagated: Vec<f64> = dark.propagated().collect();
@@ -211,7 +215,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         if !self.system.pass.with_offset {
             return Ok(None);
         }
-        self.known = Known::default();
+        self.known = Known::with(self.least);
         let along = self.variance_of(Functional::Offset, LACK_OF_FUNCTIONAL, control)?;
         Ok(Some([along, self.mean_variance_of_offset_alone()]))
     }
@@ -221,7 +225,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         functionals: impl ExactSizeIterator<Item = Functional>,
         control: &Control,
     ) -> Result<Vec<f64>> {
-        self.known = Known::default();
+        self.known = Known::with(self.least);
         let total = functionals.len() as u64;
         let lack = if self.dark.is_some() { LACK_WITH_DARK } else { LACK_OF_FUNCTIONAL };
         let found = (0..).zip(functionals).map(|(index, functional)| {
@@ -451,7 +455,8 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         lack: f64,
         control: &Control,
     ) -> Result<()> {
-        let Self { system, preconditioner, .. } = self;
+        let Self { system, preconditioner, least, .. } = self;
+        let least = *least;
         search.begin(system, preconditioner, b, control)?;
         let (first, mut earlier) = (search.square, 0.0);
         for iteration in 1..=MOST_ITERATIONS {
@@ -462,14 +467,15 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
                 return Ok(());
             }
             if iteration % FEWEST_ITERATIONS == 0 {
-                if search.energy - earlier <= NOTHING * lack * search.energy {
+                let is_seen = search.square <= lack * least * search.energy;
+                if is_seen && search.energy - earlier <= NOTHING * lack * search.energy {
                     break;
                 }
                 earlier = search.energy;
             }
         }
         // Rounding may leave a Ritz value next to 0, but then the residual is rounding too.
-        self.incomplete += u64::from(search.square > NOTHING * lack * first);
+        self.incomplete += u64::from(search.square > NOTHING * lack * least * first);
         Ok(())
     }
 

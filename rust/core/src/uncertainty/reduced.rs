@@ -44,6 +44,8 @@ pub(super) struct ReducedCovariance<'m, 'a, T> {
     workers: &'m Workers,
     search: ConjugateGradients<'m, 'a, T>,
     smallest: Smallest,
+    /// What an eigenvalue may be without a draw that shows it: its part in the residual is as small.
+    least: f64,
     /// 1 in the pixels whose mean M is 1, else 0.
     valid: Vec<f32>,
     count: f64,
@@ -55,6 +57,8 @@ pub(super) struct ReducedCovariance<'m, 'a, T> {
     incomplete: u64,
 }
 
+/// Eigenvalues above which single precision resolves all patterns, in units of those of equal weights.
+const RESOLVED: f64 = 1e-2;
 /// Upper limit on iterations for one right-hand side.
 const MOST_ITERATIONS: u64 = 1000;
 
@@ -114,13 +118,15 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
             }
         }
         let slope = padding.zeros(exposures.sensor().rows, workers, control);
-        let smallest = Smallest::default();
+        let least = exposures.least_eigenvalue(exposures.flux());
+        let smallest = Smallest::with(least);
         let propagated = Vec::new();
         Ok(Self {
             exposures,
             workers,
             search,
             smallest,
+            least,
             valid,
             count,
             slope,
@@ -168,24 +174,29 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
         let (mut iterations, mut earlier) = (0, 0.0);
         // What single precision holds.
         let nothing = NOTHING * lack.max(LACK_OF_DRAW);
+        let is_seen = |search: &ConjugateGradients<'_, '_, T>| {
+            search.square() <= lack * self.least * search.energy
+        };
         while smallest.iterate(search, control)? {
             iterations += 1;
             if iterations >= FEWEST_ITERATIONS && smallest.lack(search) <= lack {
-                break;
+                return Ok(());
             }
             if iterations == MOST_ITERATIONS {
                 self.incomplete += 1;
-                break;
+                return Ok(());
             }
             // Rounding may leave a Ritz value next to 0, that of the gauge: then what the last
             // iterations brought tells.
             if iterations % FEWEST_ITERATIONS == 0 {
-                if search.energy - earlier <= nothing * search.energy {
-                    break;
+                if search.energy - earlier <= nothing * search.energy && is_seen(search) {
+                    return Ok(());
                 }
                 earlier = search.energy;
             }
         }
+        // Rounding may hide what a light exposure alone determines.
+        self.incomplete += u64::from(self.least < RESOLVED && !is_seen(search));
         Ok(())
     }
 
@@ -196,14 +207,14 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
 
     /// The standard deviation of M by pixel, in units of that of a value of weight 1.
     pub(super) fn error_map(&mut self, control: &Control) -> Result<ErrorMap> {
-        self.smallest = Smallest::default();
+        self.smallest = Smallest::with(self.least);
         let sampled = Sampled::of(self, control)?;
         Ok(sampled.map(self.deviations(&sampled)))
     }
 
     /// The variance of Σ g M of each image g of a stack, in units of that of a value of weight 1.
     pub(super) fn variances(&mut self, functionals: &[f64], control: &Control) -> Result<Vec<f64>> {
-        self.smallest = Smallest::default();
+        self.smallest = Smallest::with(self.least);
         let pixels = self.exposures.sensor().len();
         let total = (functionals.len() / pixels) as u64;
         let stack = (0..).zip(functionals.chunks_exact(pixels));
