@@ -217,6 +217,23 @@ fn a_tilt_that_a_weak_exposure_alone_determines() {
 }
 
 #[test]
+fn patterns_that_a_light_exposure_alone_determines() {
+    // Without the last, rows are compared at one distance only.
+    for lamp in [Lamp::Known, Lamp::Free] {
+        for variance in [1e-4, 1e-2, 1.0] {
+            let noise = Noise::Exposures(vec![1e-6, 1e-6, 1e-6, 1e-6, variance]);
+            let experiment = Experiment { noise, ..noisy(LONG, &CROSS).experiment() };
+            let case = Case::new(experiment.with_lamp(lamp.clone()));
+            // Of eigenvalues of 1e-6 single precision leaves functionals 3 digits, more than draws need.
+            if variance < 0.1 {
+                case.check_functionals(&case.functionals());
+            }
+            case.check_map();
+        }
+    }
+}
+
+#[test]
 fn functionals_of_fluxes_with_a_prior() {
     // Between pixels the penalty resists the tilt that a prior leaves open, which no error bar knows.
     let std = vec![3e-4, 2e-4, 4e-4, 3e-4, 3e-4];
