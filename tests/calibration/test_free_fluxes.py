@@ -30,7 +30,7 @@ def planes(shape):
         ((1, 0.9, 0.1, 0.1, 0.1), (1, 1, 1, 1, 1), 0.0),
         ((1, 0.9, 0.1, 0.1, 0.1), (1, 1, 1, 1, 1), 0.4),
         ((1, 1, 1, 1, 1), (1, 1, 1, 100, 100), 0.0),
-        ((1, 0.5, 2, 0.02, 1), (1, 3, 1, 1, 30), 0.0),
+        ((1, 0.5, 2, 0.1, 1), (1, 3, 1, 1, 30), 0.0),
     ],
 )
 def test_a_lamp_and_the_noise_may_vary_by_a_hundred(flux, noise, fraction):
@@ -52,6 +52,8 @@ def test_a_lamp_and_the_noise_may_vary_by_a_hundred(flux, noise, fraction):
     assert off == pytest.approx(least, rel=0.5 * 14 * (72 / 19) ** 2 / 4320)
 
 
+# The drift is steep enough to be taken for a wrong flux.
+@pytest.mark.filterwarnings("ignore:.*times the light of the others")
 @pytest.mark.parametrize("turn", [0, 90, 180, 270])
 @pytest.mark.parametrize("drift", [0.8, 2.5])
 def test_the_pixels_of_the_gauge_are_those_at_the_fluxes_given(turn, drift):

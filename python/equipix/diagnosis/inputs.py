@@ -133,10 +133,11 @@ def on_brightness(exposures: Exposures) -> str | None:
         return None
     (worst,) = far
     given = "" if is_free else f", for its flux of {flux.values[worst]:g}"
+    remedy = "" if is_free else "; flux='fit' (--flux fit) finds the fluxes of a lamp that varies"
     return (
         f"{exposures.name_of(int(worst))} has {max(found[worst], 0.0):.2g} times the light of the "
         f"others in the same cells of the beam{given} (expected 1, limit {limit[worst]:.3g} or its "
-        "inverse): check its frames and its flux, or leave it out"
+        f"inverse): check its frames and its flux, or leave it out{remedy}"
     )
 
 

@@ -116,7 +116,10 @@ pub(super) fn check_light(tallies: &[Tally]) -> Result<()> {
     }
     for (exposure, tally) in tallies.iter().enumerate() {
         if tally.used == 0 {
-            let problem = format!("leaves nothing of exposure {exposure}: leave it out");
+            let problem = format!(
+                "leaves nothing of exposure {exposure}: every pixel of it is masked or not a \
+                 number, leave it out"
+            );
             return Err(Error::value("mask", problem));
         }
         if tally.largest >= VALUES.end || (tally.largest < VALUES.start && tally.positive > 0) {
