@@ -47,8 +47,8 @@ def test_a_lamp_and_the_noise_may_vary_by_a_hundred(flux, noise, fraction):
     given = equipix.calibrate(frames, shifts, flux=flux, **options)
     assert free.converged
     off, least = (error_without_tilt(one.sensitivity, truth) for one in (free, given))
-    # Two combinations of fluxes beside 4320 pixels. Squares rise by χ² of 2 degrees, below 14 in 999 of 1000 cases, times
-    # the variance of bends across the sensor, up to (72/19)² that of a pixel.
+    # Two combinations of fluxes beside 4320 pixels. Squares rise by χ² of 2 degrees, below 14 in
+    # 999 of 1000 cases, times the variance of bends across the sensor, up to (72/19)² a pixel's.
     assert off == pytest.approx(least, rel=0.5 * 14 * (72 / 19) ** 2 / 4320)
 
 
@@ -120,8 +120,8 @@ def test_a_tilt_that_little_light_determines_has_its_standard_deviation(lamp, li
     calibration = equipix.calibrate(frames, FAR, variance=variance, uncertainty=True, **options)
     assert calibration.converged
     wanted = tilt_std(exact, FAR, rotation, variance, columns)
-    # The problem at what was found is that of the truth but for noise of 1 % of a value: 1e-4 by its square, and twice
-    # as much as its mean over 2688 pixels.
+    # The problem at what was found is that of the truth but for noise of 1 % of a value: 1e-4 by
+    # its square, and twice as much as its mean over 2688 pixels.
     assert calibration.tilt_std == pytest.approx(wanted, rel=1e-3)
 
 
