@@ -128,6 +128,8 @@ def by_signal(residuals: Floats, signal: Floats) -> float:
         a line through them explains; 0 where it does not rise to at least 1.5 times its start.
     """
     known = np.isfinite(residuals) & np.isfinite(signal)
+    if np.count_nonzero(known) < _BINS:
+        return 0.0
     order = np.argsort(signal[known])
     groups = np.array_split(order, _BINS)
     squares = np.array([np.mean(residuals[known][group] ** 2) for group in groups])
