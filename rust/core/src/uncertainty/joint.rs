@@ -459,6 +459,8 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         let least = *least;
         search.begin(system, preconditioner, b, control)?;
         let (first, mut earlier) = (search.square, 0.0);
+        let is_seen =
+            |search: &ConjugateGradients<N>| search.square <= lack * least * search.energy;
         for iteration in 1..=MOST_ITERATIONS {
             search.product(system, control)?;
             let goes_on = search.step(system, preconditioner, control)?;
@@ -467,15 +469,14 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
                 return Ok(());
             }
             if iteration % FEWEST_ITERATIONS == 0 {
-                let is_seen = search.square <= lack * least * search.energy;
-                if is_seen && search.energy - earlier <= NOTHING * lack * search.energy {
+                if is_seen(search) && search.energy - earlier <= NOTHING * lack * search.energy {
                     break;
                 }
                 earlier = search.energy;
             }
         }
         // Rounding may leave a Ritz value next to 0, but then the residual is rounding too.
-        self.incomplete += u64::from(search.square > NOTHING * lack * least * first);
+        self.incomplete += u64::from(search.square > NOTHING * lack * first || !is_seen(search));
         Ok(())
     }
 
