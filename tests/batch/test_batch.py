@@ -348,6 +348,26 @@ def test_who_waits_behind_a_task_that_ends_processes_is_not_blamed():
     assert [row.status for row in found.values()] == ["done"] * 3
 
 
+def _deadly_at_last(job, _):
+    time.sleep(0.5 if job.name == "deadly" else 0)
+    return _deadly(job, _)
+
+
+@pytest.mark.long
+def test_a_result_that_is_lost_with_its_process_is_made_again(monkeypatch):
+    """It is found lost while the first result is seen to; no scheduler has ended."""
+    monkeypatch.setattr(cluster_of_dask, "_ROUNDS", 1)
+    jobs = [Job(name, None, None, ".tif", {}, None, False) for name in ("first", "a", "deadly")]
+    tasks = [Task(job, 10**8 - number) for number, job in enumerate(jobs)]
+    rows = {}
+    for task, row in finished(_deadly_at_last, tasks, None, 1):
+        if not rows:
+            time.sleep(2)
+        rows[task.job.name] = row
+    assert rows.pop("deadly").startswith("each process that worked on it ended")
+    assert [row.status for row in rows.values()] == ["done"] * 2
+
+
 _ASLEEP = """
 import time
 from typing import NamedTuple

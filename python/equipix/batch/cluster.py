@@ -99,8 +99,11 @@ def _round(
         task = sent.pop(future)
         if future.status == "finished":
             yield task, future.result()
-        elif future.status != "error":
-            return  # lost with the scheduler; the next round keeps what is written whole
+        elif future.status == "cancelled":
+            return  # with the scheduler; the next round keeps what is written whole
+        elif future.status != "error":  # the process ended that held the result: it is made again
+            sent[future] = task
+            left.add(future)
         elif isinstance(future.exception(), KilledWorker) and not is_alone:
             # Dask blames all tasks that wait where a process ends: each is tried alone.
             suspects.append(task)
