@@ -270,6 +270,28 @@ fn free_fluxes_may_be_far_from_those_given() {
 }
 
 #[test]
+fn a_light_exposure_costs_few_passes_between_pixels() {
+    let shifts = [[0.0, 0.0], [0.4, 11.0], [0.0, 19.4], [11.4, 0.4], [19.2, 0.0]];
+    let passes = |flux: &[f64], degrees: &[i64]| {
+        let simulation = Simulation::seeing(even, [100, 120], &shifts).with_noise(1e-3, 3);
+        let experiment = simulation.with_flux(flux).turned(degrees).experiment();
+        let answer = fit(&experiment, Options::to(1e-6)).unwrap();
+        assert!(answer.converged, "{:?}", answer.history.last());
+        answer.history.last().unwrap().passes
+    };
+    for (degrees, places) in [([0; 5], &[0, 2, 4][..]), ([0, 0, 0, 0, 180], &[4])] {
+        let most = 2 * passes(&[1.0; 5], &degrees);
+        for light in [0.1, 0.01] {
+            for &place in places {
+                let mut flux = [1.0; 5];
+                flux[place] = light;
+                assert!(passes(&flux, &degrees) <= most, "{flux:?}, {degrees:?}");
+            }
+        }
+    }
+}
+
+#[test]
 fn a_pixel_without_an_offset_does_not_count_for_the_slope_of_the_gauge() {
     let experiment = noisy(SMALL, &CROSS).at_two_levels().experiment().with_lamp(Lamp::Free);
     let (pixels, lost) = (SMALL[0] * SMALL[1], 10);

@@ -3,7 +3,7 @@
 use super::aggregated;
 use super::bands::Bands;
 use super::layout::{Grid, MARGIN};
-use super::rim::WIDEST;
+use super::rim;
 use crate::coarse::{self, MOST_WAVES};
 use crate::error::Result;
 use crate::exposures::Exposures;
@@ -21,7 +21,7 @@ use crate::geometry::Rotation;
 /// | … the sums of all bands | 8 for each of their values |
 /// | … the beam and a vector in each view that is turned | 16 for each of its cells |
 /// | … aggregates of cells, where there are any | what `aggregated.rs` says |
-/// | the rim and its factor | some 2000 for each of its cells, [`WIDEST`] of each row and column at most |
+/// | the rim and its factor | what `rim.rs` says |
 ///
 /// A search in single precision takes less: four vectors and the beam, 20 for each cell, and half of the sums. So
 /// does a pass between two searches: the pull, the slope and the last step, 20 for each cell, and the sums. So does
@@ -47,11 +47,10 @@ fn bytes_of(grid: &Grid, shifts: &[[f64; 2]], fitted: bool, offset: bool) -> u64
     let reached = geometry.views.iter().map(|view| 2 * MARGIN * view.shape.cols).sum::<usize>();
     let sums = bands.size(sensor.rows) + sensor.rows.div_ceil(bands.height) * reached;
     let turned = geometry.views.iter().filter(|view| view.rotation != Rotation::None).count();
-    let rim = 2000 * WIDEST as u64 * (geometry.beam.rows + geometry.beam.cols) as u64;
     of_pixel * pixels
         + (30 + of_steps + 28 + 16 * turned as u64) * cells
         + 8 * sums as u64
-        + rim
+        + rim::bytes_needed(geometry.beam)
         + coarse::bytes_needed(geometry, MOST_WAVES)
 }
 

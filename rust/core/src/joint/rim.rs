@@ -4,6 +4,10 @@
 //! behind the edges of exposures and around holes, it is none: what factors of a few thousandths tell, and
 //! the penalty, decides there. So there N + τ GᵀG, with N the sum of w c² M² over the pixels that see two
 //! cells, by their factors, is factorised as it is. The rim is a few cells wide, so its factor is small.
+//!
+//! Where a light exposure alone sees cells, the penalty outweighs what it measured, and only all these cells
+//! together tell of the patterns that the penalty allows: passes would grow as one over the root of its
+//! weight. The faintest of them are of the rim too, as many as there is room for.
 
 use super::layout::Window;
 use super::system::System;
@@ -22,7 +26,13 @@ const NEAR: usize = 3;
 pub(super) const NEAR_OF_TURNED: usize = 2;
 const SHARE: f32 = 1.0 / 6.0;
 /// A rim of more cells than these of each row and column fills the image: then its diagonal has to do.
-pub(crate) const WIDEST: usize = 16;
+const WIDEST: usize = 16;
+/// A cell is faint that has less than this share of an ordinary weight.
+const FAINT: f32 = 0.1;
+/// Rows and columns together of a grid whose rim costs little: a smaller one has as much room for faint cells.
+const FEW: usize = 1024;
+/// Bytes that a cell of the rim takes with its factor; in an area that it fills, up to twice as many.
+const BYTES: u64 = 2000;
 /// What is added to the diagonal, as a share of it, for cells that rounding alone determines.
 const RIDGE: f64 = 1e-10;
 /// Cells that lie within a spline's reach of each other, along one axis.
@@ -43,10 +53,14 @@ struct Part {
 
 impl Rim {
     pub(crate) fn new<T: Real>(system: &System<'_, '_, T>, control: &Control) -> Result<Self> {
-        let cells = if system.pass.grid.is_spline() { cells(system) } else { Vec::new() };
-        let Shape { rows, cols } = system.pass.grid.geometry.beam;
-        let fits = cells.len() <= WIDEST * (rows + cols);
-        let tiles = Tiles::new(Shape::new(rows, cols), &cells);
+        let beam = system.pass.grid.geometry.beam;
+        let is_spline = system.pass.grid.is_spline();
+        let mut cells = if is_spline { near_less(system) } else { Vec::new() };
+        let fits = cells.len() <= WIDEST * (beam.rows + beam.cols);
+        if is_spline && fits {
+            add_faint(&mut cells, room(beam), &system.weights, |cell| system.is_seen(cell));
+        }
+        let tiles = Tiles::new(beam, &cells);
         let parts = system.pass.workers.map(tiles.parts.len(), |index| {
             control.check()?;
             Ok(Part::new(system, &tiles.parts[index], fits))
@@ -109,12 +123,37 @@ impl Part {
     }
 }
 
-/// The cells of the rim.
-fn cells<T: Real>(system: &System<'_, '_, T>) -> Vec<u32> {
+/// Most bytes that the rim of such a grid takes with its factor.
+pub(crate) fn bytes_needed(beam: Shape) -> u64 {
+    BYTES * room(beam) as u64
+}
+
+/// Cells that the rim has room for, each in an area that it fills counted twice.
+fn room(beam: Shape) -> usize {
+    WIDEST * (beam.rows + beam.cols).max(FEW)
+}
+
+/// Adds the faintest of the cells that are seen to those of the rim, as long as there is room.
+fn add_faint(rim: &mut Vec<u32>, room: usize, weights: &[f32], is_seen: impl Fn(usize) -> bool) {
+    let is_faint = |&(cell, &weight): &(u32, &f32)| {
+        weight < FAINT && is_seen(cell as usize) && rim.binary_search(&cell).is_err()
+    };
+    let mut faint: Vec<u32> = (0..).zip(weights).filter(is_faint).map(|(cell, _)| cell).collect();
+    let left = room.saturating_sub(rim.len()) / 2;
+    if faint.len() > left {
+        // Weights are not negative, so their bits stand in their order.
+        faint.select_nth_unstable_by_key(left, |&cell| (weights[cell as usize].to_bits(), cell));
+        faint.truncate(left);
+    }
+    rim.append(&mut faint);
+    rim.sort_unstable();
+}
+
+/// The cells near the edge, and those near one of a small share of their weight.
+fn near_less<T: Real>(system: &System<'_, '_, T>) -> Vec<u32> {
     let is_turned = system.pass.grid.geometry.views.len() > 1;
     let near = if is_turned { NEAR_OF_TURNED } else { NEAR };
     let (weights, shape) = (&system.weights, system.pass.grid.geometry.beam);
-    let penalty = system.penalty.as_ref();
     let rows = system.pass.workers.map(shape.rows, |row| {
         let mut found = Vec::new();
         for col in 0..shape.cols {
@@ -128,7 +167,7 @@ fn cells<T: Real>(system: &System<'_, '_, T>) -> Vec<u32> {
                     let around = &weights[row * shape.cols + col - near..][..=2 * near];
                     around.iter().all(|&weight| weight >= least)
                 });
-            if !inside && (weights[cell] > 0.0 || penalty.is_some_and(|p| p.concerns(cell))) {
+            if !inside && system.is_seen(cell) {
                 found.push(cell as u32);
             }
         }
@@ -138,6 +177,11 @@ fn cells<T: Real>(system: &System<'_, '_, T>) -> Vec<u32> {
 }
 
 impl<T: Real> System<'_, '_, T> {
+    /// Whether a pixel or the penalty tells of a cell.
+    fn is_seen(&self, cell: usize) -> bool {
+        self.weights[cell] > 0.0 || self.penalty.as_ref().is_some_and(|p| p.concerns(cell))
+    }
+
     /// Calls `visit(other, value)` for the elements of N + τ GᵀG in the row of a cell; the values of one
     /// place add up.
     fn for_neighbours(&self, cell: usize, mut visit: impl FnMut(usize, f64)) {
@@ -194,5 +238,27 @@ impl<T: Real> System<'_, '_, T> {
                 sums.iter_mut().zip(line).for_each(|(sum, value)| *sum += own * factor * value);
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_faintest_cells_that_are_seen_are_of_the_rim_while_there_is_room() {
+        // The first two are of the rim, whatever their weights; the one without a weight is not seen.
+        let weights = [0.05, 1.0, 0.02, 0.0, 1.0, 0.1, 0.03, 0.02, 0.099];
+        let rim = |room| {
+            let mut rim = vec![0, 1];
+            add_faint(&mut rim, room, &weights, |cell| cell != 3);
+            rim
+        };
+        assert_eq!(rim(10), [0, 1, 2, 6, 7, 8]);
+        assert_eq!(rim(8), [0, 1, 2, 6, 7]);
+        // Of equal ones, the first in the grid.
+        assert_eq!(rim(5), [0, 1, 2]);
+        assert_eq!(rim(3), [0, 1]);
+        assert_eq!(rim(1), [0, 1]);
     }
 }
