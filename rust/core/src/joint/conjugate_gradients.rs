@@ -26,9 +26,9 @@ impl Default for Known {
 }
 
 impl Known {
-    /// With an eigenvalue that is so much smaller than that of smooth errors.
-    pub(crate) fn with(smaller: f64) -> Self {
-        Self { lowest: Lowest::new(DAMPING * smaller), iterations: 0 }
+    /// Where an eigenvalue may be so small, in units of that of smooth errors.
+    pub(crate) fn with(least: f64) -> Self {
+        Self { lowest: Lowest::new(DAMPING, least), iterations: 0 }
     }
 }
 

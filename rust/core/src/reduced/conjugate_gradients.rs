@@ -256,7 +256,7 @@ impl<'m, 'a, T: Real> ConjugateGradients<'m, 'a, T> {
 /// The smallest Ritz value found so far, and in how many iterations.
 #[derive(Clone, Debug)]
 pub(crate) struct Smallest {
-    lowest: Lowest,
+    pub(crate) lowest: Lowest,
     pub(crate) iterations: u64,
     /// Whether the last search found no direction to go at once: nothing is left but rounding, or
     /// else rounding has spoilt the problem.
@@ -271,9 +271,9 @@ impl Default for Smallest {
 }
 
 impl Smallest {
-    /// With the eigenvalue of smooth errors, known beforehand, or one that is so much smaller.
-    pub(crate) fn with(smaller: f64) -> Self {
-        let lowest = Lowest::new(DAMPING * smaller);
+    /// Where an eigenvalue may be so small, in units of that of smooth errors.
+    pub(crate) fn with(least: f64) -> Self {
+        let lowest = Lowest::new(DAMPING, least);
         Self { lowest, iterations: 0, settled: false, stuck: false }
     }
 

@@ -69,8 +69,6 @@ pub(super) struct JointCovariance<'m, 'a, T> {
     preconditioner: Preconditioner,
     /// What searches of one question have told.
     known: Known,
-    /// What an eigenvalue may be without a draw that shows it: its part in the residual is as small.
-    least: f64,
     /// S⁻¹ b of the last right-hand side b, and b · S⁻¹ b.
     x: Vec<f64>,
     energy: f64,
@@ -120,14 +118,12 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
             .map(|(determined, flags)| *determined && flags & flag::UNRELIABLE_FLAT == 0)
             .collect();
         let (valid, scale) = valid(&system, &counted);
-        let least = exposures.least_eigenvalue(solution.flux);
         Ok(Self {
             tilts: OnceCell::new(),
             solution: solution.clone(),
             system,
             preconditioner,
-            known: Known::with(least),
-            least,
+            known: Known::with(exposures.least_eigenvalue(solution.flux)),
             x: Vec::new(),
             energy: 0.0,
             considered,
@@ -156,7 +152,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
     /// What the noise of the dark adds to F, on average; 0 without a dark.
     pub(super) fn misfit_by_dark(&mut self, control: &Control) -> Result<f64> {
         let Some(left) = self.dark.as_ref().map(|dark| dark.left) else { return Ok(0.0) };
-        self.known = Known::with(self.least);
+        self.known.lowest.forget();
         let propagated = mean_misfit(count(&self.valid), |draw| {
             let slope = self.pulls_of_noise(draw, false, control)?;
             self.apply_inverse(slope, LACK_OF_FUNCTIONAL, control)?;
@@ -167,7 +163,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
 
     /// The standard deviation of M by pixel, in units of that of a value of weight 1.
     pub(super) fn error_map(&mut self, control: &Control) -> Result<ErrorMap> {
-        self.known = Known::with(self.least);
+        self.known.lowest.forget();
         let tilts = self.tilts();
         if let Some(dark) = &mut self.dark {
             let propagated: Vec<f64> = dark.propagated().collect();
@@ -215,7 +211,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         if !self.system.pass.with_offset {
             return Ok(None);
         }
-        self.known = Known::with(self.least);
+        self.known.lowest.forget();
         let along = self.variance_of(Functional::Offset, LACK_OF_FUNCTIONAL, control)?;
         Ok(Some([along, self.mean_variance_of_offset_alone()]))
     }
@@ -225,7 +221,7 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         functionals: impl ExactSizeIterator<Item = Functional>,
         control: &Control,
     ) -> Result<Vec<f64>> {
-        self.known = Known::with(self.least);
+        self.known.lowest.forget();
         let total = functionals.len() as u64;
         let lack = if self.dark.is_some() { LACK_WITH_DARK } else { LACK_OF_FUNCTIONAL };
         let found = (0..).zip(functionals).map(|(index, functional)| {
@@ -455,12 +451,12 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         lack: f64,
         control: &Control,
     ) -> Result<()> {
-        let Self { system, preconditioner, least, .. } = self;
-        let least = *least;
+        let Self { system, preconditioner, .. } = self;
         search.begin(system, preconditioner, b, control)?;
         let (first, mut earlier) = (search.square, 0.0);
-        let is_seen =
-            |search: &ConjugateGradients<N>| search.square <= lack * least * search.energy;
+        let is_seen = |search: &ConjugateGradients<N>| {
+            search.known.lowest.shows(search.square, lack * search.energy)
+        };
         for iteration in 1..=MOST_ITERATIONS {
             search.product(system, control)?;
             let goes_on = search.step(system, preconditioner, control)?;

@@ -44,8 +44,6 @@ pub(super) struct ReducedCovariance<'m, 'a, T> {
     workers: &'m Workers,
     search: ConjugateGradients<'m, 'a, T>,
     smallest: Smallest,
-    /// What an eigenvalue may be without a draw that shows it: its part in the residual is as small.
-    least: f64,
     /// 1 in the pixels whose mean M is 1, else 0.
     valid: Vec<f32>,
     count: f64,
@@ -57,8 +55,6 @@ pub(super) struct ReducedCovariance<'m, 'a, T> {
     incomplete: u64,
 }
 
-/// Eigenvalues above which single precision resolves all patterns, in units of those of equal weights.
-const RESOLVED: f64 = 1e-2;
 /// Upper limit on iterations for one right-hand side.
 const MOST_ITERATIONS: u64 = 1000;
 
@@ -118,15 +114,13 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
             }
         }
         let slope = padding.zeros(exposures.sensor().rows, workers, control);
-        let least = exposures.least_eigenvalue(exposures.flux());
-        let smallest = Smallest::with(least);
+        let smallest = Smallest::with(exposures.least_eigenvalue(exposures.flux()));
         let propagated = Vec::new();
         Ok(Self {
             exposures,
             workers,
             search,
             smallest,
-            least,
             valid,
             count,
             slope,
@@ -173,10 +167,7 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
         search.begin(control)?;
         let (mut iterations, mut earlier) = (0, 0.0);
         // What single precision holds.
-        let nothing = NOTHING * lack.max(LACK_OF_DRAW);
-        let is_seen = |search: &ConjugateGradients<'_, '_, T>| {
-            search.square() <= lack * self.least * search.energy
-        };
+        let held = lack.max(LACK_OF_DRAW);
         while smallest.iterate(search, control)? {
             iterations += 1;
             if iterations >= FEWEST_ITERATIONS && smallest.lack(search) <= lack {
@@ -189,14 +180,16 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
             // Rounding may leave a Ritz value next to 0, that of the gauge: then what the last
             // iterations brought tells.
             if iterations % FEWEST_ITERATIONS == 0 {
-                if search.energy - earlier <= nothing * search.energy && is_seen(search) {
+                let is_at_end = search.energy - earlier <= NOTHING * held * search.energy;
+                if is_at_end && smallest.lowest.shows(search.square(), held * search.energy) {
                     return Ok(());
                 }
                 earlier = search.energy;
             }
         }
         // Rounding may hide what a light exposure alone determines.
-        self.incomplete += u64::from(self.least < RESOLVED && !is_seen(search));
+        let is_seen = smallest.lowest.shows(search.square(), held * search.energy);
+        self.incomplete += u64::from(!is_seen);
         Ok(())
     }
 
@@ -207,14 +200,14 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
 
     /// The standard deviation of M by pixel, in units of that of a value of weight 1.
     pub(super) fn error_map(&mut self, control: &Control) -> Result<ErrorMap> {
-        self.smallest = Smallest::with(self.least);
+        self.smallest.lowest.forget();
         let sampled = Sampled::of(self, control)?;
         Ok(sampled.map(self.deviations(&sampled)))
     }
 
     /// The variance of Σ g M of each image g of a stack, in units of that of a value of weight 1.
     pub(super) fn variances(&mut self, functionals: &[f64], control: &Control) -> Result<Vec<f64>> {
-        self.smallest = Smallest::with(self.least);
+        self.smallest.lowest.forget();
         let pixels = self.exposures.sensor().len();
         let total = (functionals.len() / pixels) as u64;
         let stack = (0..).zip(functionals.chunks_exact(pixels));
