@@ -13,7 +13,7 @@ import pytest
 import equipix
 from equipix import cli, errors, simulate
 from equipix.cli import terminal
-from equipix.diagnosis import coverage
+from equipix.diagnosis import coverage, rules
 from equipix.exposures.exposures import Exposures
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Positions
@@ -242,3 +242,18 @@ def test_measurements_left_out_add_a_remedy_to_a_fit_far_from_its_minimum(ended,
     evidence.exposures = taken.without(dead)
     more = coverage.too_far(evidence)
     assert more.startswith(f"{plain}. Besides, 3 measurements along ragged edges")
+
+
+def test_a_flux_that_the_light_contradicts_is_the_cause_of_a_fit_that_fails():
+    frames = exposures(CROSS)
+    frames[2] *= 0.1
+    flux = Flux.of(None, None, None, len(CROSS))
+    taken = Exposures.of(measured_of(frames), Positions.of(CROSS), flux)
+    fit = SimpleNamespace(ended="stalled", error_estimate=np.array([2.0]), lost=[], sweeps=[9])
+    options = SimpleNamespace(fit=SimpleNamespace(tolerance=1e-6, max_sweeps=None))
+    evidence = SimpleNamespace(fit=fit, exposures=taken, options=options)
+    words = coverage.too_far(evidence)
+    assert "exposure 2 (from 0) has 0.1 times the light" in words
+    assert "use more light" not in words
+    (rule,) = (each for each in rules.AFTER if each.kind == "convergence")
+    assert "whose light contradicts its flux" in rule.ask(evidence)

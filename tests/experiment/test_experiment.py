@@ -197,6 +197,23 @@ def test_the_second_measurement_of_shifts_gains(tmp_path, monkeypatch):
     assert first > 1.5 * second
 
 
+def test_a_first_calibration_that_spoils_the_spots_leaves_them_as_taken(manifest, monkeypatch):
+    """As that of an exposure whose flux is not as given: its own finding is to be heard."""
+    measured, found = experiment_run.measured_moves, []
+
+    def spoilt(*arguments, **options):
+        if found:
+            raise errors.SpotError("a doubled spot")
+        found.append(measured(*arguments, **options))
+        return found[0]
+
+    monkeypatch.setattr(experiment_run, "measured_moves", spoilt)
+    with pytest.warns(errors.MisfitWarning, match=r"images as taken.*\(a doubled spot\)"):
+        cal = Experiment.load(manifest).run(tolerance=1e-4)
+    np.testing.assert_array_equal(cal.metadata["measured_shifts"], found[0].shifts)
+    np.testing.assert_array_equal(cal.metadata["measured_shift_std"], found[0].std)
+
+
 def test_turned_exposures_are_placed_by_the_aperture():
     """Numbers of the rotation formula: the same hole before and after a turn."""
     from equipix.exposures.positions import in_beam, variance_in_beam

@@ -6,6 +6,7 @@ from equipix import _native
 from equipix._check import Bools, union
 from equipix._native import Fit
 from equipix.diagnosis.evidence import Evidence
+from equipix.diagnosis.inputs import on_brightness
 from equipix.exposures.exposures import Exposures
 from equipix.exposures.positions import whole_moves
 from equipix.findings import Flag, usable
@@ -84,13 +85,15 @@ def too_far(evidence: Evidence) -> str | None:
     error = float(fit.error_estimate[-1])
     if error <= FAR:  # a NaN is not
         return None
-    more = "use larger shifts in a beam with more structure"
+    cause = "use larger shifts in a beam with more structure"
     if fit.ended == "sweeps used":
-        more = f"allow more sweeps, or {more}"
+        cause = f"allow more sweeps, or {cause}"
+    if fits_noise(fit):
+        cause = why_weak(exposures)
     return (
         "the fit ended far from its minimum, and determines no pixel (estimated relative error "
         f"{error:.1e}, limit {FAR:g}): "
-        f"{why_weak(exposures) if fits_noise(fit) else more}{left_out(exposures, fit)}"
+        f"{on_brightness(exposures) or cause}{left_out(exposures, fit)}"
     )
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from equipix.diagnosis.coverage import left_out, too_far, too_few, too_heavy, why_weak
 from equipix.diagnosis.evidence import Evidence
+from equipix.diagnosis.inputs import on_brightness
 from equipix.diagnosis.small_errors import small_errors_found
 from equipix.findings import Rule
 from equipix.fitting.error_bars import fits_noise, incomplete_searches, why_none
@@ -141,7 +142,9 @@ def _on_convergence(e: Evidence) -> str | None:
     fit, tolerance = e.fit, e.options.fit.tolerance
     if fit.ended == "converged":
         return None
-    if fits_noise(fit):
+    if on_brightness(e.exposures):
+        remedy = ": see to the exposure whose light contradicts its flux"
+    elif fits_noise(fit):
         remedy = f": {why_weak(e.exposures)}"
     elif fit.ended == "sweeps used":
         remedy = ": allow more sweeps"

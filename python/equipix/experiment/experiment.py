@@ -8,7 +8,7 @@ import numpy as np
 from equipix._check import Array, ArrayLike, Floats, FluxModel, Method, Progress, naming_memory
 from equipix.calibration.calibrate import calibrated
 from equipix.calibration.result import Calibration
-from equipix.errors import InputError
+from equipix.errors import InputError, SpotError
 from equipix.experiment.aperture import (
     Equalisation,
     Moves,
@@ -214,8 +214,12 @@ class Experiment(Described[Manifest]):
         if whole:
             exposures = exposures.at(positions.whole(std))
         elif self._is_moved():
-            shifts, std = self._measured_again(exposures, moves, darks, options)
-            exposures = exposures.at(Positions.of(shifts, rotation=positions.rotation, std=std))
+            try:
+                shifts, std = self._measured_again(exposures, moves, darks, options)
+            except SpotError as error:  # a wrong exposure has spoilt the first calibration
+                said += say(_measured_once(error))
+            else:
+                exposures = exposures.at(Positions.of(shifts, rotation=positions.rotation, std=std))
         del darks, hot, colours, moves  # maps of the sensor
         origin |= {"measured_shifts": shifts.tolist(), "measured_shift_std": std.tolist()}
         return calibrated(exposures, options, said=said, provenance=origin)
@@ -260,3 +264,12 @@ class Experiment(Described[Manifest]):
         """The values of a key that all exposures have, or none."""
         values = [getattr(exposure, key) for exposure in self.manifest.exposure]
         return [value for value in values if value is not None] or None
+
+
+def _measured_once(error: SpotError) -> Finding:
+    """Finding on images of the aperture that a first calibration makes worse."""
+    words = (
+        "corrected by a first calibration an image of the aperture has no single spot, so the "
+        f"shifts are those of the images as taken: other findings say what is wrong ({error})"
+    )
+    return Finding("aperture", words, "misfit")
