@@ -175,6 +175,17 @@ def test_a_false_scale_is_named_with_its_size():
         assert scale == pytest.approx(1, abs=0.34)
 
 
+def test_one_wrong_shift_is_no_false_scale():
+    """Of the outermost of three rows it explains most of what a scale would."""
+    rng = np.random.default_rng(4)
+    for exposure, error in [(4, (1, 0)), (2, (0, -0.4))]:
+        given = CROSS.astype(float)
+        given[exposure] += error
+        found = found_in(*photograph(rng, wavy(rng), given=given))
+        assert found.cause == "shifts"
+        assert "scale" not in found.remedy
+
+
 def test_flicker_while_rows_are_read_is_common_to_rows():
     for seed in range(3):
         assert found_in(*with_flicker(np.random.default_rng([12, seed]))).cause == "rows"
