@@ -16,6 +16,7 @@ import warnings
 from dataclasses import asdict
 from importlib import import_module
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -366,6 +367,23 @@ def test_a_result_that_is_lost_with_its_process_is_made_again(monkeypatch):
         rows[task.job.name] = row
     assert rows.pop("deadly").startswith("each process that worked on it ended")
     assert [row.status for row in rows.values()] == ["done"] * 2
+
+
+@pytest.mark.parametrize("status", ["error", "cancelled"])
+def test_a_result_that_is_lost_while_it_is_fetched_is_none(status):
+    distributed = pytest.importorskip("distributed")
+    future = SimpleNamespace(status="finished")
+
+    def result():
+        future.status = status
+        if status == "error":
+            raise distributed.KilledWorker("task", None, 3)
+        raise distributed.CancelledError
+
+    future.result = result
+    assert cluster_of_dask._fetched(future) == []
+    whole = SimpleNamespace(status="finished", result=lambda: None)
+    assert cluster_of_dask._fetched(whole) == [None]
 
 
 _ASLEEP = """

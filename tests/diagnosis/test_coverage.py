@@ -22,6 +22,7 @@ from equipix.report.figures import summary
 from given import written_experiment
 
 SHAPE, CROSS = (40, 50), equipix.cross_pattern(5, 7)
+AT_ITS_END = SimpleNamespace(fit=SimpleNamespace(tolerance=1e-6, max_sweeps=None))
 
 
 def exposures(shifts, noise=1e-3):
@@ -137,7 +138,9 @@ def test_positions_that_scatter_about_a_line_lie_on_it():
     flux = Flux.of(None, None, None, 4)
     for away, words in ((0.03, "they lie on one line"), (1.0, "the light is too weak")):
         places = np.array([(0, 0), (away, 11.3), (-away, 18.6), (away, 24.2)])
-        assert words in coverage.why_weak(Exposures.of(taken, Positions.of(places), flux))
+        fit = SimpleNamespace(ended="stalled", error_estimate=np.array([2.0]))
+        given = Exposures.of(taken, Positions.of(places), flux)
+        assert words in coverage.why_far(SimpleNamespace(fit=fit, exposures=given), "")
 
 
 def test_bad_pixels_are_a_cause():
@@ -230,7 +233,7 @@ def test_measurements_left_out_add_a_remedy_to_a_fit_far_from_its_minimum(ended,
     fit = SimpleNamespace(ended=ended, error_estimate=np.array([2.0]), lost=[])
     measured, flux = measured_of(exposures(CROSS)), Flux.of(None, None, None, len(CROSS))
     taken = Exposures.of(measured, Positions.of(CROSS), flux)
-    evidence = SimpleNamespace(fit=fit, exposures=taken)
+    evidence = SimpleNamespace(fit=fit, exposures=taken, options=AT_ITS_END)
     plain = coverage.too_far(evidence)
     assert remedy in plain
     fit.lost = [[3], [1, 4]]
@@ -244,16 +247,25 @@ def test_measurements_left_out_add_a_remedy_to_a_fit_far_from_its_minimum(ended,
     assert more.startswith(f"{plain}. Besides, 3 measurements along ragged edges")
 
 
-def test_a_flux_that_the_light_contradicts_is_the_cause_of_a_fit_that_fails():
+@pytest.mark.parametrize(
+    ("ended", "error"), [("stalled", 2.0), ("stalled", 1e-3), ("sweeps used", 2.0)]
+)
+def test_a_flux_that_the_light_contradicts_is_the_cause_of_a_fit_that_fails(ended, error):
     frames = exposures(CROSS)
     frames[2] *= 0.1
     flux = Flux.of(None, None, None, len(CROSS))
     taken = Exposures.of(measured_of(frames), Positions.of(CROSS), flux)
-    fit = SimpleNamespace(ended="stalled", error_estimate=np.array([2.0]), lost=[], sweeps=[9])
-    options = SimpleNamespace(fit=SimpleNamespace(tolerance=1e-6, max_sweeps=None))
-    evidence = SimpleNamespace(fit=fit, exposures=taken, options=options)
-    words = coverage.too_far(evidence)
-    assert "exposure 2 (from 0) has 0.1 times the light" in words
-    assert "use more light" not in words
+    fit = SimpleNamespace(ended=ended, error_estimate=np.array([error]), lost=[], sweeps=[9])
+    evidence = SimpleNamespace(fit=fit, exposures=taken, options=AT_ITS_END)
     (rule,) = (each for each in rules.AFTER if each.kind == "convergence")
-    assert "whose light contradicts its flux" in rule.ask(evidence)
+    cause = r"exposure 2 \(from 0\) has 0\.1 times the light that its flux says: check"
+    assert re.search(cause, rule.ask(evidence))
+    assert error < 1 or re.search(cause, coverage.too_far(evidence))
+    # Who limits the passes is told of the limit; lines are a cause before fluxes.
+    evidence.options = SimpleNamespace(fit=SimpleNamespace(tolerance=1e-6, max_sweeps=8))
+    if ended == "sweeps used":
+        assert rule.ask(evidence).endswith(": allow more sweeps")
+    evidence.exposures = Exposures.of(
+        measured_of(frames), Positions.of(np.multiply(CROSS, [1, 0])), flux
+    )
+    assert "do not determine the sensitivity" in rule.ask(evidence)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import equipix
 from equipix import simulate
-from equipix.diagnosis.misfit import misfit
+from equipix.diagnosis.misfit import _scale_words, misfit
 from equipix.errors import EquipixWarning, MisfitWarning
 from equipix.exposures.exposures import FitOptions
+from equipix.exposures.positions import Positions
 from equipix.fitting import windows
 from equipix.fitting.residuals import bands, lag_one, sampled
 
@@ -184,6 +186,17 @@ def test_one_wrong_shift_is_no_false_scale():
         found = found_in(*photograph(rng, wavy(rng), given=given))
         assert found.cause == "shifts"
         assert "scale" not in found.remedy
+
+
+@pytest.mark.parametrize(("shifts", "is_told"), [(CROSS, True), ([(0, 0), (0, 7), (5, 0)], False)])
+def test_a_scale_is_named_where_one_shift_would_not_do_the_same(shifts, is_told):
+    """With one move along each axis it would, to rounding."""
+    shifts = np.array(shifts, float)
+    exposures = SimpleNamespace(positions=Positions.of(shifts))
+    weighted = SimpleNamespace(exposures=exposures)
+    for scale in np.linspace(0.01, 0.1, 50):
+        words = _scale_words(weighted, -scale * shifts)
+        assert ("along rows and" in words) == is_told
 
 
 def test_flicker_while_rows_are_read_is_common_to_rows():

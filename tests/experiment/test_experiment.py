@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -197,21 +198,40 @@ def test_the_second_measurement_of_shifts_gains(tmp_path, monkeypatch):
     assert first > 1.5 * second
 
 
-def test_a_first_calibration_that_spoils_the_spots_leaves_them_as_taken(manifest, monkeypatch):
-    """As that of an exposure whose flux is not as given: its own finding is to be heard."""
-    measured, found = experiment_run.measured_moves, []
+def with_fluxes(manifest, edited, last):
+    """The manifest with the fluxes 1, 1, 1, 1 and one that need not be true."""
+    fluxes = iter([1, 1, 1, 1, last])
+    text = manifest.read_text()
+    return edited(
+        text, re.sub(r"frames = \"frames", lambda m: f"flux = {next(fluxes)}\n{m[0]}", text)
+    )
 
-    def spoilt(*arguments, **options):
-        if found:
-            raise errors.SpotError("a doubled spot")
-        found.append(measured(*arguments, **options))
-        return found[0]
 
-    monkeypatch.setattr(experiment_run, "measured_moves", spoilt)
-    with pytest.warns(errors.MisfitWarning, match=r"images as taken.*\(a doubled spot\)"):
-        cal = Experiment.load(manifest).run(tolerance=1e-4)
-    np.testing.assert_array_equal(cal.metadata["measured_shifts"], found[0].shifts)
-    np.testing.assert_array_equal(cal.metadata["measured_shift_std"], found[0].std)
+@pytest.mark.parametrize("factor", [3, 100])
+def test_a_wrong_flux_spoils_the_spots_and_is_named(edited, manifest, factor):
+    """They are doubled, or too uncertain: the shifts are then those of the images as taken."""
+    experiment = Experiment.load(with_fluxes(manifest, edited, factor))
+    with warnings.catch_warnings(record=True, action="always") as said:
+        cal = experiment.run(max_sweeps=60)
+    assert [each.message.kind for each in said][:2] == ["aperture", "flux"]
+    wanted = f"exposure 'p4' has {1 / factor:.2g} times the light that its flux says"
+    assert wanted in str(said[0].message)
+    shifts, std = experiment.measure_shifts()
+    np.testing.assert_array_equal(cal.metadata["measured_shifts"], shifts)
+    np.testing.assert_array_equal(cal.metadata["measured_shift_std"], std)
+
+
+def test_spots_that_no_flux_has_spoilt_are_refused(manifest, monkeypatch):
+    measured = iter([experiment_run.measured_moves])
+
+    def once(*arguments, **options):
+        for measure in measured:
+            return measure(*arguments, **options)
+        raise errors.SpotError("a doubled spot")
+
+    monkeypatch.setattr(experiment_run, "measured_moves", once)
+    with pytest.raises(errors.SpotError, match="a doubled spot"):
+        Experiment.load(manifest).run(tolerance=1e-4)
 
 
 def test_turned_exposures_are_placed_by_the_aperture():

@@ -270,7 +270,8 @@ fn free_fluxes_may_be_far_from_those_given() {
 }
 
 #[test]
-fn a_light_exposure_costs_few_passes_between_pixels() {
+fn a_weak_exposure_costs_few_passes_between_pixels() {
+    // Where the penalty outweighs cells they grow as one over the root of the weight: 3 and 10 times as many.
     let shifts = [[0.0, 0.0], [0.4, 11.0], [0.0, 19.4], [11.4, 0.4], [19.2, 0.0]];
     let passes = |flux: &[f64], degrees: &[i64]| {
         let simulation = Simulation::seeing(even, [100, 120], &shifts).with_noise(1e-3, 3);

@@ -4,7 +4,7 @@ import logging
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing import resource_tracker
 from threading import Lock
 from typing import Any, NamedTuple, TypeVar
@@ -97,11 +97,12 @@ def _round(
     is_alone = False
     for future in _ended(client, left, sent):
         task = sent.pop(future)
-        if future.status == "finished":
-            yield task, future.result()
+        found = _fetched(future)
+        if found:
+            yield task, found[0]
         elif future.status == "cancelled":
-            return  # with the scheduler; the next round keeps what is written whole
-        elif future.status != "error":  # the process ended that held the result: it is made again
+            return  # the scheduler ended; the next round keeps what is written whole
+        elif future.status != "error":  # the process that held the result ended: it is made again
             sent[future] = task
             left.add(future)
         elif isinstance(future.exception(), KilledWorker) and not is_alone:
@@ -112,6 +113,16 @@ def _round(
         if suspects and not sent:
             is_alone = True
             left.add(send(suspects.pop()))
+
+
+def _fetched(future: Any) -> list[Any]:
+    """The result of a future; none where it has none, or loses it meanwhile."""
+    from distributed import CancelledError, KilledWorker
+
+    if future.status == "finished":
+        with suppress(CancelledError, KilledWorker):
+            return [future.result()]
+    return []
 
 
 def _ended(client: Any, left: Any, sent: dict[Any, Task]) -> Iterator[Any]:

@@ -6,7 +6,7 @@ from equipix import _native
 from equipix._check import Bools, union
 from equipix._native import Fit
 from equipix.diagnosis.evidence import Evidence
-from equipix.diagnosis.inputs import on_brightness
+from equipix.diagnosis.inputs import wrong_flux
 from equipix.exposures.exposures import Exposures
 from equipix.exposures.positions import whole_moves
 from equipix.findings import Flag, usable
@@ -36,12 +36,19 @@ _HEAVY = 100.0
 """
 
 
-def why_weak(exposures: Exposures) -> str:
-    """Return why a fit does not come near its minimum: positions, weights, or else the light."""
+def why_far(evidence: Evidence, otherwise: str) -> str:
+    """Return why a fit does not come near its minimum: positions, fluxes, weights, or the light.
+
+    Light and weights where it fits noise; else what the caller says.
+    """
+    fit, exposures = evidence.fit, evidence.exposures
     cause = _uncompared(exposures)
     if cause:
         return f"the positions do not determine the sensitivity, since {cause}"
-    return too_heavy(exposures) or TOO_WEAK
+    is_limited = fit.ended == "sweeps used" and evidence.options.fit.max_sweeps is not None
+    if not is_limited and (cause := wrong_flux(exposures)):
+        return f"{cause}: check its frames and its flux, or find the fluxes by flux='fit'"
+    return too_heavy(exposures) or TOO_WEAK if fits_noise(fit) else otherwise
 
 
 def too_heavy(exposures: Exposures) -> str:
@@ -85,15 +92,12 @@ def too_far(evidence: Evidence) -> str | None:
     error = float(fit.error_estimate[-1])
     if error <= FAR:  # a NaN is not
         return None
-    cause = "use larger shifts in a beam with more structure"
+    more = "use larger shifts in a beam with more structure"
     if fit.ended == "sweeps used":
-        cause = f"allow more sweeps, or {cause}"
-    if fits_noise(fit):
-        cause = why_weak(exposures)
+        more = f"allow more sweeps, or {more}"
     return (
         "the fit ended far from its minimum, and determines no pixel (estimated relative error "
-        f"{error:.1e}, limit {FAR:g}): "
-        f"{on_brightness(exposures) or cause}{left_out(exposures, fit)}"
+        f"{error:.1e}, limit {FAR:g}): {why_far(evidence, more)}{left_out(exposures, fit)}"
     )
 
 

@@ -103,10 +103,10 @@ _CLEAR = 10.0
 """Standard deviations of noise that the light of an exposure, over these pixels, must be."""
 
 
-def on_brightness(exposures: Exposures) -> str | None:
-    """Say which exposure has far more or less light than its flux says; None if not just one.
+def _contradicted(exposures: Exposures) -> tuple[int, float, float] | None:
+    """The exposure of far more or less light than its flux says, how much, and the limit.
 
-    Wrong shifts in a steep beam make several exposures look so.
+    None if it is not just one: wrong shifts in a steep beam make several look so.
     """
     # Values with an offset are not proportional to light.
     if exposures.offset or exposures.raw or exposures.positions.are_turned:
@@ -131,14 +131,34 @@ def on_brightness(exposures: Exposures) -> str | None:
     (far,) = np.nonzero((found > limit) | (found < 1 / limit))
     if len(far) != 1:
         return None
-    (worst,) = far
-    given = "" if is_free else f", for its flux of {flux.values[worst]:g}"
-    remedy = "" if is_free else "; flux='fit' (--flux fit) finds the fluxes of a lamp that varies"
+    worst = int(far[0])
+    return worst, max(float(found[worst]), 0.0), float(limit[worst])
+
+
+def on_brightness(exposures: Exposures) -> str | None:
+    """Say which exposure has far more or less light than its flux says."""
+    contradicted = _contradicted(exposures)
+    if contradicted is None:
+        return None
+    worst, light, limit = contradicted
+    given = remedy = ""
+    if exposures.flux.kind not in ("fit", "linear"):
+        given = f", for its flux of {exposures.flux.values[worst]:g}"
+        remedy = "; flux='fit' (--flux fit) finds the fluxes of a lamp that varies"
     return (
-        f"{exposures.name_of(int(worst))} has {max(found[worst], 0.0):.2g} times the light of the "
-        f"others in the same cells of the beam{given} (expected 1, limit {limit[worst]:.3g} or its "
-        f"inverse): check its frames and its flux, or leave it out{remedy}"
+        f"{exposures.name_of(worst)} has {light:.2g} times the light of the others in the same "
+        f"cells of the beam{given} (expected 1, limit {limit:.3g} or its inverse): check its "
+        f"frames and its flux, or leave it out{remedy}"
     )
+
+
+def wrong_flux(exposures: Exposures) -> str:
+    """Words on the same as a cause of something else; none without one."""
+    contradicted = _contradicted(exposures)
+    if contradicted is None:
+        return ""
+    worst, light, _ = contradicted
+    return f"{exposures.name_of(worst)} has {light:.2g} times the light that its flux says"
 
 
 def _relative_light(exposures: Exposures, middle: int, moves: Array) -> Array:

@@ -392,16 +392,17 @@ def _scale_words(weighted: Weighted, found: Floats) -> str:
         return ""
     away = positions.shifts - positions.shifts.mean(axis=0)
     errors = found - found.mean(axis=0)
-    taken = 1 - 1 / len(positions)
+    left = 1 - 1 / len(positions)
     words = []
     for name, d, e in zip(("rows", "columns"), away.T, errors.T, strict=True):
         length = float(d @ d)
         factor = float(d @ e) / length if length > 0 else 0.0
-        # Of one wrong shift all others seem wrong by the mean.
-        by_one = float(np.max(e**2)) / taken
-        if factor**2 * length > max(_MOST * float(e @ e), by_one) and abs(factor) > 1e-3:
+        # One wrong shift, less the mean of all, explains so much of the squares.
+        by_one = float(np.max(e**2)) / left
+        by_scale = factor**2 * length
+        if _ENOUGH * by_scale > max(_MOST * float(e @ e), by_one) and abs(factor) > 1e-3:
             # The sensitivity takes 1/n of what an error of a shift leaves.
-            words.append(f"{-factor / taken:+.1%} along {name}")
+            words.append(f"{-factor / left:+.1%} along {name}")
     return f" (their scale seems wrong by about {' and '.join(words)})" if words else ""
 
 

@@ -4,9 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from equipix.diagnosis.coverage import left_out, too_far, too_few, too_heavy, why_weak
+from equipix.diagnosis.coverage import left_out, too_far, too_few, too_heavy, why_far
 from equipix.diagnosis.evidence import Evidence
-from equipix.diagnosis.inputs import on_brightness
 from equipix.diagnosis.small_errors import small_errors_found
 from equipix.findings import Rule
 from equipix.fitting.error_bars import fits_noise, incomplete_searches, why_none
@@ -142,18 +141,15 @@ def _on_convergence(e: Evidence) -> str | None:
     fit, tolerance = e.fit, e.options.fit.tolerance
     if fit.ended == "converged":
         return None
-    if on_brightness(e.exposures):
-        remedy = ": see to the exposure whose light contradicts its flux"
-    elif fits_noise(fit):
-        remedy = f": {why_weak(e.exposures)}"
-    elif fit.ended == "sweeps used":
-        remedy = ": allow more sweeps"
+    if fit.ended == "sweeps used":
+        remedy = ": " + why_far(e, "allow more sweeps")
     else:
-        remedy = ", and no longer decreasing: " + (
-            too_heavy(e.exposures)
-            or "use a larger 'tolerance', more positions or closer ones, or mask pixels that "
+        more = too_heavy(e.exposures) or (
+            "use a larger 'tolerance', more positions or closer ones, or mask pixels that "
             "receive almost no light"
         )
+        stalled = "" if fits_noise(fit) else ", and no longer decreasing"
+        remedy = f"{stalled}: {why_far(e, more)}"
     sweeps, error = int(fit.sweeps[-1]), float(fit.error_estimate[-1])
     most, after = e.options.fit.max_sweeps, f"not converged after {sweeps} sweeps"
     if most is not None and sweeps > most:

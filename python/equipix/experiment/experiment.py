@@ -8,7 +8,8 @@ import numpy as np
 from equipix._check import Array, ArrayLike, Floats, FluxModel, Method, Progress, naming_memory
 from equipix.calibration.calibrate import calibrated
 from equipix.calibration.result import Calibration
-from equipix.errors import InputError, SpotError
+from equipix.diagnosis.inputs import wrong_flux
+from equipix.errors import InputError
 from equipix.experiment.aperture import (
     Equalisation,
     Moves,
@@ -173,7 +174,8 @@ class Experiment(Described[Manifest]):
         -----
         Shifts with a standard error are refined, with it as their prior: see `calibrate`. Those
         measured from images of an aperture are measured twice, the second time on images corrected
-        by a first calibration of the part of the sensor around the spots.
+        by a first calibration of the part of the sensor around the spots, unless a flux that is
+        not as given has spoilt it.
         """
         fit_options = FitOptions.of(method, tolerance, max_sweeps, workers, progress)
         options = Options(fit_options, robust=robust, uncertainty=uncertainty)
@@ -215,11 +217,14 @@ class Experiment(Described[Manifest]):
             exposures = exposures.at(positions.whole(std))
         elif self._is_moved():
             try:
-                shifts, std = self._measured_again(exposures, moves, darks, options)
-            except SpotError as error:  # a wrong exposure has spoilt the first calibration
-                said += say(_measured_once(error))
+                again = self._measured_again(exposures, moves, darks, options)
+                positions = Positions.of(again[0], rotation=positions.rotation, std=again[1])
+            except InputError:  # no single spot, or one that is too uncertain
+                if not (cause := wrong_flux(exposures)):
+                    raise
+                said += say(_measured_once(cause))
             else:
-                exposures = exposures.at(Positions.of(shifts, rotation=positions.rotation, std=std))
+                (shifts, std), exposures = again, exposures.at(positions)
         del darks, hot, colours, moves  # maps of the sensor
         origin |= {"measured_shifts": shifts.tolist(), "measured_shift_std": std.tolist()}
         return calibrated(exposures, options, said=said, provenance=origin)
@@ -266,10 +271,10 @@ class Experiment(Described[Manifest]):
         return [value for value in values if value is not None] or None
 
 
-def _measured_once(error: SpotError) -> Finding:
-    """Finding on images of the aperture that a first calibration makes worse."""
+def _measured_once(cause: str) -> Finding:
+    """Finding on images of the aperture that a first calibration has made worse."""
     words = (
-        "corrected by a first calibration an image of the aperture has no single spot, so the "
-        f"shifts are those of the images as taken: other findings say what is wrong ({error})"
+        f"{cause}, which has spoilt the first calibration: the images of the aperture are not "
+        "corrected by it, and the shifts are as uncertain as unequal pixels make them"
     )
     return Finding("aperture", words, "misfit")

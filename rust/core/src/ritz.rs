@@ -56,24 +56,23 @@ impl Ritz {
 #[derive(Clone, Debug)]
 pub(crate) struct Lowest {
     values: Vec<f64>,
-    /// What an eigenvalue may be without a residual that shows it: its part there is as small.
-    least: f64,
 }
 
 impl Lowest {
-    /// Before any iteration, with the eigenvalue of smooth errors, and one `least` times as large that may be.
-    pub(crate) fn new(smooth: f64, least: f64) -> Self {
-        Self { values: vec![smooth * least], least }
+    /// Before any iteration, with the smallest eigenvalue that there may be.
+    pub(crate) fn new(least: f64) -> Self {
+        Self { values: vec![least] }
     }
 
-    /// As before any iteration.
+    /// Drops what iterations have found.
     pub(crate) fn forget(&mut self) {
         self.values.truncate(1);
     }
 
-    /// Whether r · P⁻¹ r is so small that no eigenvalue that may be leaves more than `lacking` of x · b.
-    pub(crate) fn shows(&self, square: f64, lacking: f64) -> bool {
-        square <= self.least * lacking
+    /// Whether x · b lacks no more than `lack` even if there is the smallest eigenvalue that there may be. A pattern
+    /// of a small one is as small in the residual, so that a search may end before a Ritz value belongs to it.
+    pub(crate) fn is_complete(&self, square: f64, lack: f64) -> bool {
+        square <= self.values[0] * lack
     }
 
     /// A value that is none counts as 0.
@@ -107,7 +106,7 @@ mod tests {
 
     #[test]
     fn a_value_that_still_falls_is_expected_to_fall_on() {
-        let mut lowest = Lowest::new(0.25, 1.0);
+        let mut lowest = Lowest::new(0.25);
         for value in [1.0, 0.2, 0.3, 0.1, 0.1] {
             lowest.push(value);
         }
@@ -119,23 +118,23 @@ mod tests {
     }
 
     #[test]
-    fn an_eigenvalue_that_may_be_is_looked_for() {
-        let mut lowest = Lowest::new(0.25, 0.1);
+    fn no_pattern_of_an_eigenvalue_that_may_be_is_missed() {
+        let mut lowest = Lowest::new(0.1);
         lowest.push(0.01);
-        assert!(lowest.shows(1e-7, 1e-6) && !lowest.shows(2e-7, 1e-6));
+        assert!(lowest.is_complete(0.9e-7, 1e-6) && !lowest.is_complete(1.1e-7, 1e-6));
         lowest.forget();
-        assert!(lowest.found() == 0.025 && (lowest.expected() - 0.025).abs() < 1e-17);
+        assert!(lowest.found() == 0.1 && (lowest.expected() - 0.1).abs() < 1e-16);
     }
 
     #[test]
     fn without_a_positive_value_nothing_is_known() {
         for value in [0.0, -1e-3, f64::NEG_INFINITY, f64::NAN] {
-            let mut lowest = Lowest::new(0.25, 1.0);
+            let mut lowest = Lowest::new(0.25);
             assert!((lowest.over(1e-9) - 4e-9).abs() < 1e-20);
             lowest.push(value);
             assert!(lowest.over(1e-9) == f64::INFINITY && lowest.over(0.0) == f64::INFINITY);
         }
-        assert!(Lowest::new(0.25, 1.0).over(f64::NAN) == f64::INFINITY);
+        assert!(Lowest::new(0.25).over(f64::NAN) == f64::INFINITY);
     }
 
     #[test]

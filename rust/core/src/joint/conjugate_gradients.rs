@@ -26,9 +26,9 @@ impl Default for Known {
 }
 
 impl Known {
-    /// Where an eigenvalue may be so small, in units of that of smooth errors.
+    /// With the smallest eigenvalue that there may be, in units of that of smooth errors.
     pub(crate) fn with(least: f64) -> Self {
-        Self { lowest: Lowest::new(DAMPING, least), iterations: 0 }
+        Self { lowest: Lowest::new(DAMPING * least), iterations: 0 }
     }
 }
 

@@ -21,7 +21,7 @@ use crate::geometry::Rotation;
 /// | … the sums of all bands | 8 for each of their values |
 /// | … the beam and a vector in each view that is turned | 16 for each of its cells |
 /// | … aggregates of cells, where there are any | what `aggregated.rs` says |
-/// | the rim and its factor | what `rim.rs` says |
+/// | the rim and its factor | some 2000 for each of its cells, as many as `rim.rs` has room for |
 ///
 /// A search in single precision takes less: four vectors and the beam, 20 for each cell, and half of the sums. So
 /// does a pass between two searches: the pull, the slope and the last step, 20 for each cell, and the sums. So does

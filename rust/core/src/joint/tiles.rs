@@ -15,7 +15,7 @@ use std::f64::consts::FRAC_PI_2;
 use crate::frames::Shape;
 
 /// Cells along the side of a tile, at least, unless the grid is smaller. Each is factorised in some
-/// hundredths of a second, which nothing interrupts.
+/// hundredths of a second, or in one second where the rim fills it, which nothing interrupts.
 const TILE: usize = 256;
 /// How far tiles reach beyond their borders, in cells.
 const OVERLAP: f64 = 16.0;

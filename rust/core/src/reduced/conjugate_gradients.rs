@@ -271,9 +271,9 @@ impl Default for Smallest {
 }
 
 impl Smallest {
-    /// Where an eigenvalue may be so small, in units of that of smooth errors.
+    /// With the smallest eigenvalue that there may be, in units of that of smooth errors.
     pub(crate) fn with(least: f64) -> Self {
-        let lowest = Lowest::new(DAMPING, least);
+        let lowest = Lowest::new(DAMPING * least);
         Self { lowest, iterations: 0, settled: false, stuck: false }
     }
 

@@ -454,25 +454,32 @@ impl<'m, 'a, T: Real> JointCovariance<'m, 'a, T> {
         let Self { system, preconditioner, .. } = self;
         search.begin(system, preconditioner, b, control)?;
         let (first, mut earlier) = (search.square, 0.0);
-        let is_seen = |search: &ConjugateGradients<N>| {
-            search.known.lowest.shows(search.square, lack * search.energy)
+        let is_complete = |search: &ConjugateGradients<N>| {
+            search.known.lowest.is_complete(search.square, lack * search.energy)
         };
         for iteration in 1..=MOST_ITERATIONS {
             search.product(system, control)?;
             let goes_on = search.step(system, preconditioner, control)?;
             let left = search.square / search.known.lowest.found();
-            if !goes_on || iteration >= FEWEST_ITERATIONS && left <= lack * search.energy {
+            if iteration >= FEWEST_ITERATIONS && left <= lack * search.energy {
+                return Ok(());
+            }
+            if !goes_on {
+                // A b that is rounding has no solution at all.
+                self.incomplete += u64::from(iteration > 1 && !is_complete(search));
                 return Ok(());
             }
             if iteration % FEWEST_ITERATIONS == 0 {
-                if is_seen(search) && search.energy - earlier <= NOTHING * lack * search.energy {
+                if is_complete(search) && search.energy - earlier <= NOTHING * lack * search.energy
+                {
                     break;
                 }
                 earlier = search.energy;
             }
         }
         // Rounding may leave a Ritz value next to 0, but then the residual is rounding too.
-        self.incomplete += u64::from(search.square > NOTHING * lack * first || !is_seen(search));
+        self.incomplete +=
+            u64::from(search.square > NOTHING * lack * first || !is_complete(search));
         Ok(())
     }
 

@@ -181,15 +181,15 @@ impl<'m, 'a, T: Real> ReducedCovariance<'m, 'a, T> {
             // iterations brought tells.
             if iterations % FEWEST_ITERATIONS == 0 {
                 let is_at_end = search.energy - earlier <= NOTHING * held * search.energy;
-                if is_at_end && smallest.lowest.shows(search.square(), held * search.energy) {
+                if is_at_end && smallest.lowest.is_complete(search.square(), lack * search.energy) {
                     return Ok(());
                 }
                 earlier = search.energy;
             }
         }
-        // Rounding may hide what a light exposure alone determines.
-        let is_seen = smallest.lowest.shows(search.square(), held * search.energy);
-        self.incomplete += u64::from(!is_seen);
+        // Rounding may hide what a weak exposure alone determines; a b that is rounding has no solution at all.
+        let is_complete = smallest.lowest.is_complete(search.square(), held * search.energy);
+        self.incomplete += u64::from(iterations > 0 && !is_complete);
         Ok(())
     }
 
