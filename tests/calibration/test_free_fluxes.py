@@ -52,6 +52,26 @@ def test_a_lamp_and_the_noise_may_vary_by_a_hundred(flux, noise, fraction):
     assert off == pytest.approx(least, rel=0.5 * 14 * (72 / 19) ** 2 / 4320)
 
 
+def test_a_weak_exposure_has_its_own_variance_where_whole_shifts_determine_no_pixel():
+    """Rounded, these four positions leave parts unconnected; there the medians are the signal."""
+    shape = (70, 80)
+    shifts = np.array([(0.1, 0.3), (0.4, 10.7), (0.4, 18.5), (11.3, 0.3)])
+    camera = simulate.Camera(sensitivity=simulate.paper_sensitivity(shape, rng=1), dark=80.0)
+    dark = equipix.average(camera.frames(np.zeros(shape), 5, rng=9))
+    flat = simulate.exposures(
+        np.full(shape, 14000.0), simulate.gaussian_beam(shape), shifts, flux=[1, 0.15, 1, 1]
+    )
+    frames = [
+        equipix.average(camera.frames(light, 5, rng=k), dark=dark) for k, light in enumerate(flat)
+    ]
+    given = equipix.calibrate(frames, shifts, flux=[1, 0.15, 1, 1])
+    with pytest.warns(IdentifiabilityWarning, match="tilt"):
+        free = equipix.calibrate(frames, shifts, flux="fit")
+    # Of at least one measurement in each pixel beyond M and L.
+    assert free.reduced_chi2 == pytest.approx(given.reduced_chi2, abs=np.sqrt(2 / flat[0].size))
+    assert [found.kind for found in free.findings] == ["tilt"]
+
+
 # The drift is steep enough to be taken for a wrong flux.
 @pytest.mark.filterwarnings("ignore:.*times the light of the others")
 @pytest.mark.parametrize("turn", [0, 90, 180, 270])

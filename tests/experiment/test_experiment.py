@@ -569,7 +569,10 @@ def test_a_missing_spot_names_the_move(edited, manifest, tmp_path):
 
 def test_an_exposure_without_light_is_refused(edited, manifest, tmp_path):
     path = edited('"frames/p3.tif"', another_dark(manifest, tmp_path))
-    with pytest.raises(errors.InputError, match="median"):
+    with (
+        pytest.warns(errors.MisfitWarning, match="'p3' has 0 times the light that its flux says"),
+        pytest.raises(errors.InputError, match="median"),
+    ):
         Experiment.load(path).run()
 
 

@@ -226,8 +226,12 @@ def modelled(exposures: Exposures, signals: Iterator[Array], variances: Array) -
 def expected(
     exposures: Exposures, fit: Fit, middle: Floats, workers: int | None
 ) -> Iterator[Array]:
-    """Signals c · L · M; c times the medians `middle` where the fit determines none."""
-    for k, flux in enumerate(exposures.flux.values):
+    """Signals c · L · M; c times the medians `middle` where the fit determines none.
+
+    There c is that of the fit too, in the units in which the medians were taken.
+    """
+    unit = np.median(exposures.flux.values / fit.flux)
+    for k, flux in enumerate(unit * np.array(fit.flux)):
         signal = exposures.light(fit, k, workers)
         for rows in blocks(signal.shape):
             signal[rows] *= fit.sensitivity[rows]
