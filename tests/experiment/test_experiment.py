@@ -567,6 +567,7 @@ def test_a_missing_spot_names_the_move(edited, manifest, tmp_path):
         Experiment.load(path).run()
 
 
+@pytest.mark.filterwarnings("ignore:.*times the light of the others")
 def test_an_exposure_without_light_is_refused(edited, manifest, tmp_path):
     path = edited('"frames/p3.tif"', another_dark(manifest, tmp_path))
     with (
