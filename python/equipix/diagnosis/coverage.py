@@ -39,16 +39,22 @@ _HEAVY = 100.0
 def why_far(evidence: Evidence, otherwise: str) -> str:
     """Return why a fit does not come near its minimum: positions, fluxes, weights, or the light.
 
-    Light and weights where it fits noise; else what the caller says.
+    Weights where it stalled, light where it fits noise; else what the caller says.
     """
     fit, exposures = evidence.fit, evidence.exposures
     cause = _uncompared(exposures)
     if cause:
         return f"the positions do not determine the sensitivity, since {cause}"
-    is_limited = fit.ended == "sweeps used" and evidence.options.fit.max_sweeps is not None
-    if not is_limited and (cause := wrong_flux(exposures)):
+    if not is_limited(evidence) and (cause := wrong_flux(exposures)):
         return f"{cause}: check its frames and its flux, or find the fluxes by flux='fit'"
-    return too_heavy(exposures) or TOO_WEAK if fits_noise(fit) else otherwise
+    if fit.ended == "stalled" and (cause := too_heavy(exposures)):
+        return cause
+    return TOO_WEAK if fits_noise(fit) else otherwise
+
+
+def is_limited(evidence: Evidence) -> bool:
+    """Whether the fit ended at the caller's limit of sweeps."""
+    return evidence.fit.ended == "sweeps used" and evidence.options.fit.max_sweeps is not None
 
 
 def too_heavy(exposures: Exposures) -> str:

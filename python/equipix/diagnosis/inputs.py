@@ -123,9 +123,8 @@ def _contradicted(exposures: Exposures) -> tuple[int, float, float] | None:
         return None
     found /= np.nanmedian(found)
     flux = exposures.flux
-    is_free = flux.kind in ("fit", "linear")
     limit = np.maximum(_FAR, _FALL ** np.sum(np.abs(moves) / exposures.shape, axis=1))
-    limit = np.maximum(limit, _BLACK) if is_free else limit
+    limit = np.maximum(limit, _BLACK) if flux.is_fitted else limit
     if flux.std is not None:
         limit = np.maximum(limit, np.exp(_STDS * flux.std))
     (far,) = np.nonzero((found > limit) | (found < 1 / limit))
@@ -142,7 +141,7 @@ def on_brightness(exposures: Exposures) -> str | None:
         return None
     worst, light, limit = contradicted
     given = remedy = ""
-    if exposures.flux.kind not in ("fit", "linear"):
+    if not exposures.flux.is_fitted:
         given = f", for its flux of {exposures.flux.values[worst]:g}"
         remedy = "; flux='fit' (--flux fit) finds the fluxes of a lamp that varies"
     return (

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from equipix.diagnosis.coverage import left_out, too_far, too_few, too_heavy, why_far
+from equipix.diagnosis.coverage import is_limited, left_out, too_far, too_few, why_far
 from equipix.diagnosis.evidence import Evidence
 from equipix.diagnosis.small_errors import small_errors_found
 from equipix.findings import Rule
@@ -144,12 +144,12 @@ def _on_convergence(e: Evidence) -> str | None:
     if fit.ended == "sweeps used":
         remedy = ": " + why_far(e, "allow more sweeps")
     else:
-        more = too_heavy(e.exposures) or (
+        remedy = "" if fits_noise(fit) else ", and no longer decreasing"
+        remedy += ": " + why_far(
+            e,
             "use a larger 'tolerance', more positions or closer ones, or mask pixels that "
-            "receive almost no light"
+            "receive almost no light",
         )
-        stalled = "" if fits_noise(fit) else ", and no longer decreasing"
-        remedy = f"{stalled}: {why_far(e, more)}"
     sweeps, error = int(fit.sweeps[-1]), float(fit.error_estimate[-1])
     most, after = e.options.fit.max_sweeps, f"not converged after {sweeps} sweeps"
     if most is not None and sweeps > most:
@@ -168,10 +168,9 @@ def _on_dark(e: Evidence) -> str | None:
     if e.dark is None:
         return None
     along, alone = e.dark.std_along_sensitivity, e.dark.std_of_a_pixel
-    limited = e.fit.ended == "sweeps used" and e.options.fit.max_sweeps is not None
     if along is not None and alone is not None and along > alone:
         known = f"its standard deviation is {along:.1e}, that of a pixel by noise {alone:.1e}"
-    elif e.fit.ended != "converged" and not limited:
+    elif e.fit.ended != "converged" and not is_limited(e):
         known = "the fit did not determine it"
     else:
         return None

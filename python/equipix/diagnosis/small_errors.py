@@ -164,7 +164,7 @@ def small_errors(weighted: Weighted, options: FitOptions) -> list[SmallError]:
     fit = weighted.fit
     # Errors of shifts that are not refined leave residuals of their own.
     given = weighted.exposures.positions.std is not None and fit.refinement != "refined"
-    fitted = weighted.exposures.flux.kind in ("fit", "linear")
+    fitted = weighted.exposures.flux.is_fitted
     if given or fitted or weighted.exposures.filters is not None:
         return []
     if fit.degrees_of_freedom < FEWEST or fit.ended != "converged":

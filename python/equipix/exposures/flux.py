@@ -34,6 +34,11 @@ class Flux(ReadOnly):
     std: Floats | None = None
     time: Floats | None = None
 
+    @property
+    def is_fitted(self) -> bool:
+        """Whether c is fitted without a prior."""
+        return self.kind in ("fit", "linear")
+
     @classmethod
     def of(
         cls,
