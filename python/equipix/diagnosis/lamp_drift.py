@@ -95,7 +95,7 @@ class Drift(ReadOnly):
             "First check the shifts: in a smooth beam wrong ones look the same. A drift of the "
             "lamp hides a tilt of the sensitivity, edge to edge, of probably "
             f"{rows:.1e} along rows and {cols:.1e} along columns{self._words_of_trend}: give "
-            "fluxes of a monitor, or turn one exposure by 90 or 180 degrees and use flux='fit'"
+            "fluxes of a monitor, or add an exposure turned by 90 or 180 degrees and use flux='fit'"
         )
 
     @property
