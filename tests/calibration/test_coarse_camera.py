@@ -48,6 +48,25 @@ def test_one_dark_frame_makes_error_bars_too_large_and_not_too_small(frames):
     assert 0.5 < np.sqrt(np.mean(z**2)) < 1
 
 
+@pytest.mark.parametrize("dark_frames", [1, 4])
+def test_single_frames_have_the_noise_of_their_dark(dark_frames):
+    """Without it they deviated by 1.42 and 1.12 standard deviations."""
+    rng = np.random.default_rng(1)
+    truth = simulate.paper_sensitivity(SHAPE, rng=rng)
+    cross = equipix.cross_pattern(5, 7)
+    light = 8000 * simulate.exposures(truth, simulate.gaussian_beam(SHAPE), cross)
+
+    def taken(light, count):
+        noise = rng.poisson(light, (count, *SHAPE)) + 60 * rng.standard_normal((count, *SHAPE))
+        return np.rint(1000 + noise).astype(np.uint16)
+
+    dark = equipix.average(taken(np.zeros(SHAPE), dark_frames))
+    frames = [equipix.average(taken(each, 1), dark=dark) for each in light]
+    cal = equipix.calibrate(frames, cross, uncertainty=True)
+    z = (cal.sensitivity - truth / truth.mean()) / cal.sensitivity_std
+    assert abs(z.std() - 1) < 5 / np.sqrt(2 * z.size)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_a_dark_that_is_finer_than_its_rounding_shows_no_pattern(seed):

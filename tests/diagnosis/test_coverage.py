@@ -84,8 +84,8 @@ class TestHeavy:
         ([(0, 0), (0, 7), (0, 11), (0, 19)], {}, "they lie on one line"),
         ([(0.5, 0.1), (0.5, 7.1), (0.5, 11.1), (0.5, 19.1)], {}, "they lie on one line"),
         (equipix.cross_pattern(4, 6), {}, "leave 4 parts .* unconnected: choose other shifts"),
-        (CROSS, {"mask": stripes()}, "pixels between them are masked"),
-        (CROSS + 0.5, {"mask": stripes()}, "pixels between them are masked"),
+        (CROSS, {"mask": stripes()}, "values between them are masked"),
+        (CROSS + 0.5, {"mask": stripes()}, "values between them are masked"),
         (CROSS, {"saturation": 0.97}, "most of the others reach the saturation level"),
     ],
     ids=[
@@ -269,3 +269,30 @@ def test_a_flux_that_the_light_contradicts_is_the_cause_of_a_fit_that_fails(ende
         measured_of(frames), Positions.of(np.multiply(CROSS, [1, 0])), flux
     )
     assert "do not determine the sensitivity" in rule.ask(evidence)
+
+
+def test_a_pixel_that_masks_leave_alone_is_no_fault_of_the_shifts():
+    cells = {tuple(shift) for shift in CROSS.tolist()}
+    others = {(r - a, c - b) for r, c in cells for a, b in cells}
+    mask = np.zeros(SHAPE, bool)
+    for r, c in others - {(0, 0)}:
+        if min(r, c) >= 0:
+            mask[r, c] = True
+    with pytest.warns(errors.IdentifiabilityWarning, match="undetermined"):
+        cal = equipix.calibrate(exposures(CROSS), CROSS, mask=mask)
+    (words,) = [each.message for each in cal.findings if each.kind == "components"]
+    assert "sensitivity of 1 pixel outside" in words
+    assert "masked, missing or saturated: use shorter shifts" in words
+
+
+def test_residuals_of_clipped_values_are_no_news():
+    """They are not those of small variances."""
+    rng = np.random.default_rng(1)
+    beam = simulate.gaussian_beam(SHAPE, width=60)
+    frames = simulate.exposures(simulate.paper_sensitivity(SHAPE, rng=rng), beam, CROSS)
+    frames += 3e-3 * rng.standard_normal(frames.shape)
+    clipped = np.minimum(frames, np.quantile(frames, 0.9))
+    with pytest.warns(errors.InputWarning, match="saturation"):
+        cal = equipix.calibrate(clipped, CROSS, variance=np.full(5, 9e-6))
+    assert [each.kind for each in cal.findings] == ["saturation"]
+    assert cal.reduced_chi2 > 1.1

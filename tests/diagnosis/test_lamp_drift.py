@@ -21,6 +21,7 @@ from equipix.plan.drift import affine_columns, distinct_trend, slope_covariance,
 from given import exposures_of
 
 SENSOR, NOISE = (48, 64), 1e-3
+CROSS = equipix.cross_pattern(5, 7)
 SEVEN = np.array([(0, 0), (3, 9), (9, 2), (-7, 8), (5, -9), (-3, -8), (-9, 1)], float)
 
 
@@ -52,6 +53,24 @@ def test_fluxes_without_drift_scatter_as_noise_does(draws, figure):
         "probabilities of no drift, distance from an even distribution", distance, f"< {limit:.3f}"
     )
     assert distance < limit
+
+
+@pytest.mark.parametrize("light", [0.8, 0.995, 1.3])
+@pytest.mark.parametrize(
+    ("shifts", "wrong", "alike"),
+    [(SEVEN, 2, {2}), (CROSS, 0, {0}), (CROSS, 3, {3, 4})],
+    ids=["seven", "first of a cross", "one arm of a cross"],
+)
+def test_one_exposure_of_other_light_is_named(shifts, wrong, alike, light):
+    """Both ends of an arm of a cross leave the same residual."""
+    frames, *_ = photograph(np.random.default_rng(1), 0.0, shifts)
+    frames[wrong] *= light
+    with pytest.warns(MisfitWarning, match=rf"exposure {wrong} \(from 0\) [\d.]+ times"):
+        drift = equipix.calibrate(frames, shifts, variance=np.full(len(shifts), NOISE**2)).drift
+    found = dict(drift.alone)
+    assert found.keys() == {f"exposure {k} (from 0)" for k in alike}
+    # The step is linear.
+    assert abs(np.log(found[f"exposure {wrong} (from 0)"] / light)) < 0.15 * abs(np.log(light))
 
 
 @pytest.mark.study

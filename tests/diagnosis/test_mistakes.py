@@ -85,6 +85,23 @@ def test_one_array_that_is_flipped_is_named(bench, axes, words, variance):
     assert any(f"exposure 3 (from 0) fits better {words}" in each.message for each in found)
 
 
+@pytest.mark.parametrize("exposure", [2, 8])
+def test_one_shift_of_the_wrong_sign_is_named(exposure):
+    """It was said to be turned by 180 degrees. With five positions too few are right to tell."""
+    shifts = np.array([*SHIFTS, (3, 4), (-4, 2), (2, -5), (-3, -6)], float)
+    rng = np.random.default_rng(1)
+    truth = simulate.paper_sensitivity(SHAPE, rng=rng)
+    values = np.array([truth * simulate.beams.window(_beam, SHAPE, each) for each in shifts])
+    values += 7 * rng.standard_normal(values.shape)
+    row, col = shifts[exposure]
+    shifts[exposure] *= -1
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", errors.EquipixWarning)
+        found = equipix.calibrate(values, shifts, variance=np.full(9, 49.0)).findings
+    words = f"exposure {exposure} (from 0) fits better at the shift ({row:g}, {col:g}) than at"
+    assert any(words in each.message for each in found)
+
+
 def test_a_flip_that_leaves_less_than_half_a_percent_is_named():
     """A pattern of 0.4 % in nearly even light: chi-square is above 100."""
     rng = np.random.default_rng(0)

@@ -143,7 +143,7 @@ def _cause(evidence: Evidence, missing: Bools) -> str:
         )
     if _most(missing, (flags & Flag.UNRELIABLE_FLAT) != 0):
         return "most of the others receive almost no light: mask them, or use more light"
-    return _cause_in_shifts(exposures, evidence.fit.components)
+    return why_apart(exposures, evidence.fit)
 
 
 def _most(missing: Bools, found: Bools | None) -> bool:
@@ -151,13 +151,16 @@ def _most(missing: Bools, found: Bools | None) -> bool:
     return found is not None and 2 * int((missing & found).sum()) > int(missing.sum())
 
 
-def _cause_in_shifts(exposures: Exposures, components: int) -> str:
-    """Return why the shifts leave pixels unconnected."""
-    result = f"the shifts leave {components} parts of the sensor unconnected"
+def why_apart(exposures: Exposures, fit: Fit) -> str:
+    """Return why the shifts leave pixels unconnected, and the remedy."""
+    result = f"the shifts leave {fit.components} parts of the sensor unconnected"
     if cause := _uncompared(exposures):
         return f"{result}, since {cause}"
-    if _mask_separates(exposures):
-        return f"{result}, since pixels between them are masked or missing: use shorter shifts"
+    if _mask_separates(exposures, int(np.count_nonzero(fit.component_labels > 0))):
+        return (
+            f"{result}, since values between them are masked, missing or saturated: use shorter "
+            "shifts, or less light where values saturate"
+        )
     return f"{result}: choose other shifts, see equipix.plan.identify"
 
 
@@ -180,10 +183,10 @@ def _uncompared(exposures: Exposures) -> str | None:
     return None
 
 
-def _mask_separates(exposures: Exposures) -> bool:
-    """Whether the same shifts connect most of a sensor without masked pixels."""
+def _mask_separates(exposures: Exposures, left: int) -> bool:
+    """Whether the same shifts leave less than half as many pixels where every value is usable."""
     rotation = exposures.positions.rotation.tolist()
     whole = whole_moves(exposures.positions.shifts)
     _, counts, _ = _native.planned_components(exposures.shape, whole, rotation=rotation, mask=None)
     rows, cols = exposures.shape
-    return max(counts) >= FEWEST_USABLE * rows * cols
+    return 2 * (rows * cols - max(counts)) < left

@@ -1,5 +1,6 @@
 """What the data say of given fluxes: the drift of the lamp, and the tilt that it hides."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -23,6 +24,10 @@ _WARNED = 1e-3
 
 _VISIBLE = 1e-6
 """Share of the variance of a trend below which what it leaves is rounding."""
+
+_ALONE = 2e-3
+"""Share of the squares of what fluxes leave up to which one flux explains them. One that is wrong
+by up to 20 % left 1e-3 at most."""
 
 _LEAST = 1e-3
 """Share of the least variance of a flux below which an ε² is as good as 0."""
@@ -62,6 +67,9 @@ class Drift(ReadOnly):
     trend_tilt : ndarray, shape (2,)
         Size of the hidden tilt, edge to edge, if the lamp drifted linearly in the order of the
         exposures and left this residual; 0 where the trend was fitted or leaves none.
+    alone : tuple of (str, float)
+        Exposures each of which alone explains them, with so many times the light that its flux
+        says; none where only one combination leaves a residual.
     """
 
     size: float
@@ -71,6 +79,7 @@ class Drift(ReadOnly):
     slope_covariance: Annotated[Floats, "float64", "2 2"]
     tilt_std: Annotated[Floats, "float64", "2"]
     trend_tilt: Annotated[Floats, "float64", "2"]
+    alone: tuple[tuple[str, float], ...] = ()
 
     @property
     def is_added(self) -> bool:
@@ -91,12 +100,17 @@ class Drift(ReadOnly):
         rows, cols = self.tilt_std
         return (
             f"the data contradict the fluxes: they differ from those given by {self.size:.1e}, rms "
-            f"(standard error {self.flux_std:.1e}, {self.degrees_of_freedom} degrees of freedom). "
-            "First check the shifts: in a smooth beam wrong ones look the same. A drift of the "
-            "lamp hides a tilt of the sensitivity, edge to edge, of probably "
+            f"(standard error {self.flux_std:.1e}, {self.degrees_of_freedom} degrees of freedom)"
+            f"{self._words_of_one}. First check the shifts: in a smooth beam wrong ones look the "
+            "same. A drift of the lamp hides a tilt of the sensitivity, edge to edge, of probably "
             f"{rows:.1e} along rows and {cols:.1e} along columns{self._words_of_trend}: give "
-            "fluxes of a monitor, or turn one exposure by 90 or 180 degrees and use flux='fit'"
+            "fluxes of a monitor, or add an exposure turned by 90 or 180 degrees and use flux='fit'"
         )
+
+    @property
+    def _words_of_one(self) -> str:
+        found = ", or ".join(f"{name} {times:.3g} times" for name, times in self.alone)
+        return f", as if one exposure had other light than its flux says: {found}" if found else ""
 
     @property
     def _words_of_trend(self) -> str:
@@ -191,7 +205,9 @@ def lamp_drift(weighted: Weighted, residuals: Residuals) -> Drift | None:
     if exposures.flux.time is None:
         trend = np.abs(_slope_of_trend(columns, fluxes, total, weights)) * exposures.shape
     known = _combinations(columns, total)
-    return Drift(size, flux_std, known, probability, covariance, tilt, trend)
+    names = [exposures.name_of(k) for k in range(len(exposures))]
+    alone = _alone(names, columns, fluxes, variances) if freedom > 1 else ()
+    return Drift(size, flux_std, known, probability, covariance, tilt, trend, alone)
 
 
 def _scatter(columns: Floats, fluxes: Floats, variances: Floats) -> float:
@@ -199,6 +215,21 @@ def _scatter(columns: Floats, fluxes: Floats, variances: Floats) -> float:
     roots = np.sqrt(variances)
     left = left_by(columns / roots[:, None], fluxes / roots)[0]
     return float(left @ left)
+
+
+def _alone(
+    names: Sequence[str], columns: Floats, fluxes: Floats, variances: Floats
+) -> tuple[tuple[str, float], ...]:
+    """Exposures each of whose flux explains what columns leave, and the factor on it."""
+    roots = np.sqrt(variances)
+    values, all_left = fluxes / roots, _scatter(columns, fluxes, variances)
+    found = []
+    for k, name in enumerate(names):
+        own = left_by(columns / roots[:, None], np.eye(len(roots))[k] / roots)[0]
+        size = float(own @ values) / float(own @ own) if own.any() else 0.0
+        if all_left - size**2 * float(own @ own) < _ALONE * all_left:
+            found.append((name, float(np.exp(size))))
+    return tuple(found)
 
 
 def _combinations(columns: Floats, variances: Floats) -> int:

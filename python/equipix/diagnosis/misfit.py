@@ -359,8 +359,8 @@ def _of_exposures(
     if illumination > limit:
         return "illumination", (
             "the illumination changes its shape between exposures: keep lamp, optics and stray "
-            "light still, and take the exposures faster. Exposures in another order, flipped, or "
-            "at other shifts than given look the same: check these first"
+            "light still, and take the exposures faster. Exposures in another order, flipped, "
+            "turned or at other shifts than given look the same: check these first"
         )
     return None
 

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from equipix.diagnosis.coverage import is_limited, left_out, too_far, too_few, why_far
+from equipix.diagnosis.coverage import is_limited, left_out, too_far, too_few, why_apart, why_far
 from equipix.diagnosis.evidence import Evidence
 from equipix.diagnosis.small_errors import small_errors_found
 from equipix.findings import Rule
@@ -50,8 +50,8 @@ def _on_tilt(e: Evidence) -> str | None:
         return None
     words = _hidden(e)
     return (
-        "free fluxes leave a tilt of the sensitivity undetermined, and its slope is set to 0: turn "
-        "one exposure by 90 or 180 degrees, or give 'flux_std' from a monitor of the lamp"
+        "free fluxes leave a tilt of the sensitivity undetermined, and its slope is set to 0: add "
+        "an exposure turned by 90 or 180 degrees, or give 'flux_std' from a monitor of the lamp"
         f"{f'. Besides, {words}' if words else ''}"
     )
 
@@ -75,9 +75,8 @@ def _on_components(e: Evidence) -> str | None:
         return None
     left = int(np.count_nonzero(e.fit.component_labels > 0))
     return (
-        f"the shifts leave {e.fit.components} parts of the sensor unconnected: the sensitivity of "
-        f"{left} pixel{'s' * (left != 1)} outside the largest part is undetermined (NaN): choose "
-        "other shifts, see equipix.plan.identify"
+        f"the sensitivity of {left} pixel{'s' * (left != 1)} outside the largest part is "
+        f"undetermined (NaN): {why_apart(e.exposures, e.fit)}"
     )
 
 
@@ -192,6 +191,9 @@ _SHIFTS = frozenset({"sign", "unit"})
 _SOURCES = _SHIFTS | {"flux"}
 """Kinds beside which a cause of residuals is no news."""
 
+_EXPLAINED = _SOURCES | {"saturation", "colour"}
+"""Kinds that leave residuals of their own, which look like those of other causes."""
+
 _STRONGER = _SOURCES | {"orientation", "variance", "prior", "drift", "colour"}
 """Kinds whose causes leave what looks like a small error."""
 
@@ -213,9 +215,9 @@ AFTER: tuple[Rule[Evidence], ...] = (
     Rule("orientation", "identifiability", _hidden, unless=_SHIFTS | {"tilt"}),
     Rule("faint", "identifiability", _on_faint, severity="note"),
     Rule("colour", "misfit", _on_colours, unless=_SOURCES),
-    Rule("misfit", "misfit", _on_common_misfit, unless=_SOURCES | {"colour"}),
-    Rule("drift", "misfit", _on_drift, unless=_SOURCES | {"colour"}),
-    Rule("misfit", "misfit", _on_white_misfit, unless=_SOURCES | {"colour"}),
+    Rule("misfit", "misfit", _on_common_misfit, unless=_EXPLAINED),
+    Rule("drift", "misfit", _on_drift, unless=_EXPLAINED),
+    Rule("misfit", "misfit", _on_white_misfit, unless=_EXPLAINED),
     Rule("prior", "misfit", _replaced("flux_std"), unless=_SOURCES),
     Rule("prior", "misfit", _replaced("shift_std"), unless=_SOURCES),
     Rule("convergence", "convergence", _on_convergence),

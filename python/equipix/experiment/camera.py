@@ -347,15 +347,13 @@ def _of_filters(filters: Filters | None) -> tuple[Finding, ...]:
     if filters is None or (filters.given and filters.shown is None):
         return ()
     shown = filters.shown or filters.colours
-    rows, cols = shown.period
-    periods = [f"{n} {axis}" for n, axis in ((rows, "rows"), (cols, "columns")) if n > 1]
-    repeats = f"the response repeats every {' and '.join(periods)}"
+    repeats, is_of_channels = f"the response repeats {shown.interval}", min(shown.period) == 1
     if filters.shown is not None:
         words = (
             f"{repeats} otherwise than 'cfa' in [sensor], '{filters.colours}', so planes have "
             f"wrong colours or mix them: {advice(shown)}"
         )
-    elif min(rows, cols) > 1:
+    elif not is_of_channels:
         words = (
             f"{repeats} by {filters.spread:.0%}, as under colour filters, and no 'cfa' is given in "
             "[sensor], so the figures mix the colours and PRNU contains them: "
@@ -367,7 +365,7 @@ def _of_filters(filters: Filters | None) -> tuple[Finding, ...]:
             "contains that. Adjust the gains of the channels; name stripes of colours by 'cfa' in "
             "[sensor]"
         )
-    return (Finding("cfa", words, "misfit", "warning" if min(rows, cols) > 1 else "note"),)
+    return (Finding("cfa", words, "misfit", "note" if is_of_channels else "warning"),)
 
 
 def _on_unit(found: CameraFigures) -> str | None:

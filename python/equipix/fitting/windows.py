@@ -316,10 +316,11 @@ _FLIPS = {"upside down": (0,), "mirrored left to right": (1,), "turned by 180 de
 def misplaced(
     exposures: Exposures, pairs: Sequence[tuple[int, int]], worst: int | None, options: FitOptions
 ) -> str | None:
-    """Which of these pairs is exchanged, or how the worst exposure is flipped, in words; or None.
+    """Which pair is exchanged, or how the worst exposure is flipped or its shift reversed.
 
-    Fits of a central window are compared, in all orders, with that as given. Shifts are held: those
-    that are found follow the mistake. Unless given, the worst exposure is that which stands out.
+    In words, or None. Fits of a central window are compared, in all orders, with that as given.
+    Shifts are held: those that are found follow the mistake. Unless given, the worst exposure is
+    that which stands out.
     """
     exposures = exposures.at(dataclasses.replace(exposures.positions, std=None))
     window = exposures.window(_SIDE)
@@ -336,6 +337,7 @@ def misplaced(
             "or its 'rotation'": _flipped(exposures, window, worst, axes)
             for flip, axes in _FLIPS.items()
         }
+        tried |= _reversed(exposures, worst)
     if not tried:
         return None
     fits = {words: WindowFit.of(each, options) for words, each in tried.items()}
@@ -358,6 +360,24 @@ def _exchanged(window: Exposures, i: int, j: int) -> Exposures:
     order = np.arange(len(window))
     order[[i, j]] = j, i
     return window.at(window.positions.chosen(order))
+
+
+def _reversed(exposures: Exposures, exposure: int) -> dict[str, Exposures]:
+    """Return the window with the shift of one exposure reversed along one axis, and along both."""
+    positions = exposures.positions
+    row, col = positions.shifts[exposure].tolist()
+    found = {}
+    for shift in ((-row, col), (row, -col), (-row, -col)):
+        if shift == (row, col):
+            continue
+        shifts = positions.shifts.copy()
+        shifts[exposure] = shift
+        words = (
+            f"{exposures.name_of(exposure)} fits better at the shift ({shift[0] + 0.0:g}, "
+            f"{shift[1] + 0.0:g}) than at ({row:g}, {col:g}): check its sign"
+        )
+        found[words] = exposures.at(dataclasses.replace(positions, shifts=shifts)).window(_SIDE)
+    return found
 
 
 def _flipped(

@@ -74,6 +74,12 @@ class Colours:
         return len(self.pattern), len(self.pattern[0])
 
     @property
+    def interval(self) -> str:
+        """The period in words: "every 2 rows and 4 columns"."""
+        counted = zip(self.period, ("rows", "columns"), strict=True)
+        return f"every {' and '.join(f'{n} {axis}' for n, axis in counted if n > 1)}"
+
+    @property
     def rows(self) -> list[list[str]]:
         """The pattern as a JSON value, which `of` reads."""
         return [list(row) for row in self.pattern]
@@ -238,25 +244,22 @@ class Filters:
         """Name a pattern that only the values show, or other than the given one; or nothing."""
         if self.given and self.shown is None:
             return ""
-        rows, cols = (self.shown or self.colours).period
+        repeats = f"the response repeats {(self.shown or self.colours).interval}"
         if self.shown is not None:
             return (
-                f"pixels of one colour of 'cfa' differ by more than {_CONTRADICTS:.0%}: the "
-                f"response repeats every {rows} rows and {cols} columns otherwise than "
-                f"'{self.colours}', so colours are mixed: {advice(self.shown)}"
+                f"pixels of one colour of 'cfa' differ by more than {_CONTRADICTS:.0%}: {repeats} "
+                f"otherwise than '{self.colours}', so colours are mixed: {advice(self.shown)}"
             )
-        if min(rows, cols) == 1:
-            axis, period = ("columns", cols) if rows == 1 else ("rows", rows)
+        if min(self.colours.period) == 1:
             return (
-                f"the response repeats every {period} {axis} by {self.spread:.0%}, as channels of "
-                "the read-out have it, not colours. No pixel is flagged for it; see whether the "
-                "gains of the channels are adjusted"
+                f"{repeats} by {self.spread:.0%}, as channels of the read-out have it, not "
+                "colours. No pixel is flagged for it; see whether the gains of the channels are "
+                "adjusted"
             )
         return (
-            f"the response repeats every {rows} rows and {cols} columns by {self.spread:.0%}, as "
-            f"under colour filters, and no 'cfa' is given. No pixel is flagged for it, but M mixes "
-            f"the colours, and a corrected frame loses its white balance: "
-            f"{advice(self.colours, self.response)}"
+            f"{repeats} by {self.spread:.0%}, as under colour filters, and no 'cfa' is given. No "
+            "pixel is flagged for it, but M mixes the colours, and a corrected frame loses its "
+            f"white balance: {advice(self.colours, self.response)}"
         )
 
     @property

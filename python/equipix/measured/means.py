@@ -303,10 +303,11 @@ class Averaged:
             for each, v, shares in zip(self.frames, own, self._shares, strict=True)
         )
 
-    def dark_variance(self, noise: NoiseModel) -> Floats | None:
+    def dark_variance(self, noise: NoiseModel | None) -> Floats | None:
         """Variance of the dark that is common to all exposures, from the noise of one frame.
 
-        Of a dark that is not kept it is what the averages state; None without any.
+        From the darks alone where no exposure shows that noise. Of a dark that is not kept it is
+        what the averages state; None without any.
         """
         if self.darks:
             common, _ = self._dark_variances(noise)
@@ -314,7 +315,7 @@ class Averaged:
         stated = float(np.mean(self._of_dark))
         return np.full(self.saturated.shape, stated) if stated > 0 else None
 
-    def _dark_variances(self, noise: NoiseModel) -> tuple[Floats | None, list[float]]:
+    def _dark_variances(self, noise: NoiseModel | None) -> tuple[Floats | None, list[float]]:
         """Variance of darks that counts as common to all exposures, and what each has beside it.
 
         Darks Σ s D of two exposures have the covariance Σ s s' var(D). Its mean over all pairs
@@ -324,7 +325,12 @@ class Averaged:
         if not self.darks:
             return None, [0.0] * len(self.frames)
         pairs = zip(self.darks, self._beside_least, strict=True)
-        variances = [_variance_of_dark(each, _noisier(noise, more)) for each, more in pairs]
+        variances = [
+            variance_of_dark_alone(each)
+            if noise is None
+            else _variance_of_dark(each, _noisier(noise, more))
+            for each, more in pairs
+        ]
 
         def covariance(one: tuple[float, ...], other: tuple[float, ...]) -> Floats:
             triples = zip(one, other, variances, strict=True)

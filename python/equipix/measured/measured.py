@@ -205,6 +205,8 @@ def _of_averaged(
         model = None
     bad_pixels = averaged.bad_pixels(model)
     dark = averaged.black if averaged.dark is None else averaged.dark.mean
+    known = variance is None or model is not None
+    of_dark = averaged.dark_variance(model) if known else None
     return Measured(
         values=averaged.values,
         mask=union(bad_pixels.dead, bad_pixels.hot, bad_pixels.noisy),
@@ -214,7 +216,7 @@ def _of_averaged(
         saturation=averaged.saturation,
         clipped=averaged.clipped,
         dark=None if dark is None else dark.astype(averaged.values.dtype, copy=False),
-        dark_variance=None if model is None else averaged.dark_variance(model),
+        dark_variance=of_dark,
         raw=averaged.raw,
         unsteady=averaged.unsteady,
         colours=averaged.colours,

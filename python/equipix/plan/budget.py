@@ -298,8 +298,8 @@ def _on_drift(budget: ErrorBudget) -> str | None:
         return None
     return (
         f"lamp drift will tilt the sensitivity by {drift:.1e} rms, {drift / noise:.1f} times the "
-        "error by noise, and leaves no residual: measure the flux, turn one exposure, or use "
-        "larger shifts of more exposures (equipix.plan.suggest)"
+        "error by noise, and leaves no residual: measure the flux, add a turned exposure, or "
+        "use larger shifts of more exposures (equipix.plan.suggest)"
     )
 
 

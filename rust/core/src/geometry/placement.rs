@@ -86,8 +86,8 @@ impl Geometry {
     /// beam cells cannot be numbered in 32 bits.
     pub fn new(sensor: Shape, shifts: &[[i64; 2]], rotations: &[Rotation]) -> Result<Self> {
         if shifts.len() < 2 {
-            let problem = format!("holds {} exposure(s), at least two are needed", shifts.len());
-            return Err(Error::value("shifts", problem));
+            let found = if shifts.is_empty() { "no exposure" } else { "one exposure" };
+            return Err(Error::value("shifts", format!("holds {found}, at least two are needed")));
         }
         if rotations.len() != shifts.len() {
             return Err(Error::Shape {
