@@ -51,20 +51,33 @@ def test_one_dark_frame_makes_error_bars_too_large_and_not_too_small(frames):
 @pytest.mark.parametrize("dark_frames", [1, 4])
 def test_single_frames_have_the_noise_of_their_dark(dark_frames):
     """Without it they deviated by 1.42 and 1.12 standard deviations."""
+    z = _single_frames(dark_frames, pattern=0.0)
+    assert abs(z.std() - 1) < 5 / np.sqrt(2 * z.size)
+
+
+@pytest.mark.parametrize("pattern", [60.0, 1000.0])
+def test_the_pattern_of_one_dark_frame_counts_as_noise_of_a_frame_at_most(pattern):
+    """Of 1000 DN it was more noise than residuals have."""
+    # Photon and read noise of a light frame are 4 times the read noise, which the dark has.
+    assert np.sqrt((1 / 5 + 1 / 4) / (1 / 5 + 1)) < _single_frames(1, pattern).std() < 1
+
+
+def _single_frames(dark_frames, pattern):
+    """Errors of M over their standard deviations, of one frame at each position."""
     rng = np.random.default_rng(1)
     truth = simulate.paper_sensitivity(SHAPE, rng=rng)
     cross = equipix.cross_pattern(5, 7)
     light = 8000 * simulate.exposures(truth, simulate.gaussian_beam(SHAPE), cross)
+    offset = 5000 + pattern * rng.standard_normal(SHAPE)
 
     def taken(light, count):
         noise = rng.poisson(light, (count, *SHAPE)) + 60 * rng.standard_normal((count, *SHAPE))
-        return np.rint(1000 + noise).astype(np.uint16)
+        return np.rint(offset + noise).astype(np.uint16)
 
     dark = equipix.average(taken(np.zeros(SHAPE), dark_frames))
     frames = [equipix.average(taken(each, 1), dark=dark) for each in light]
     cal = equipix.calibrate(frames, cross, uncertainty=True)
-    z = (cal.sensitivity - truth / truth.mean()) / cal.sensitivity_std
-    assert abs(z.std() - 1) < 5 / np.sqrt(2 * z.size)
+    return (cal.sensitivity - truth / truth.mean()) / cal.sensitivity_std
 
 
 @pytest.mark.long

@@ -285,14 +285,18 @@ def test_a_pixel_that_masks_leave_alone_is_no_fault_of_the_shifts():
     assert "masked, missing or saturated: use shorter shifts" in words
 
 
-def test_residuals_of_clipped_values_are_no_news():
-    """They are not those of small variances."""
+@pytest.mark.parametrize("flipped", [False, True])
+def test_clipped_values_do_not_show_that_variances_are_wrong(flipped):
+    """A flipped exposure is named beside them."""
     rng = np.random.default_rng(1)
     beam = simulate.gaussian_beam(SHAPE, width=60)
     frames = simulate.exposures(simulate.paper_sensitivity(SHAPE, rng=rng), beam, CROSS)
     frames += 3e-3 * rng.standard_normal(frames.shape)
+    if flipped:
+        frames[2] = frames[2, ::-1]
     clipped = np.minimum(frames, np.quantile(frames, 0.9))
-    with pytest.warns(errors.InputWarning, match="saturation"):
+    with pytest.warns(errors.EquipixWarning):
         cal = equipix.calibrate(clipped, CROSS, variance=np.full(5, 9e-6))
-    assert [each.kind for each in cal.findings] == ["saturation"]
+    kinds = [each.kind for each in cal.findings]
+    assert kinds == (["saturation", "misfit"] if flipped else ["saturation"])
     assert cal.reduced_chi2 > 1.1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 
 import numpy as np
@@ -11,7 +12,7 @@ import equipix
 from equipix import simulate
 from equipix.diagnosis import lamp_drift as lamp_drift_module
 from equipix.diagnosis.lamp_drift import lamp_drift
-from equipix.errors import MisfitWarning
+from equipix.errors import EquipixWarning, MisfitWarning
 from equipix.exposures.exposures import FitOptions
 from equipix.fitting.residuals import left_by, sampled
 from equipix.fitting.weighted import Options, weighted_fit
@@ -55,22 +56,47 @@ def test_fluxes_without_drift_scatter_as_noise_does(draws, figure):
     assert distance < limit
 
 
-@pytest.mark.parametrize("light", [0.8, 0.995, 1.3])
+@pytest.mark.parametrize("light", [0.8, 0.995, 1.003, 1.3])
 @pytest.mark.parametrize(
     ("shifts", "wrong", "alike"),
     [(SEVEN, 2, {2}), (CROSS, 0, {0}), (CROSS, 3, {3, 4})],
     ids=["seven", "first of a cross", "one arm of a cross"],
 )
 def test_one_exposure_of_other_light_is_named(shifts, wrong, alike, light):
-    """Both ends of an arm of a cross leave the same residual."""
+    """Two positions on one arm of a cross leave the same residual: (2, -7, 5) at 0, 5 and 7."""
     frames, *_ = photograph(np.random.default_rng(1), 0.0, shifts)
     frames[wrong] *= light
-    with pytest.warns(MisfitWarning, match=rf"exposure {wrong} \(from 0\) [\d.]+ times"):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", EquipixWarning)
         drift = equipix.calibrate(frames, shifts, variance=np.full(len(shifts), NOISE**2)).drift
-    found = dict(drift.alone)
+    assert re.search(rf"exposure {wrong} \(from 0\) by [+-]\d+\.\d\d%", drift.words)
+    found = {name: np.log(times) for name, times in drift.alone}
     assert found.keys() == {f"exposure {k} (from 0)" for k in alike}
-    # The step is linear.
-    assert abs(np.log(found[f"exposure {wrong} (from 0)"] / light)) < 0.15 * abs(np.log(light))
+    # A linear step; and of the squares of an error the columns leave a tenth or more.
+    error = np.log(light)
+    limit = error**2 / 2 + 5 * drift.flux_std / 0.1**0.5
+    assert abs(found[f"exposure {wrong} (from 0)"] - error) < limit
+    if len(alike) > 1:
+        other = found["exposure 4 (from 0)"]
+        assert other / found["exposure 3 (from 0)"] == pytest.approx(-7 / 5, rel=1e-2)
+
+
+def test_no_exposure_is_named_where_all_fluxes_drift():
+    drift, *_ = estimated(0, 1e-2)
+    assert drift.is_certain
+    assert drift.alone == ()
+
+
+def test_one_combination_or_one_noisy_exposure_names_none():
+    """Then each of the others explains it."""
+    flux, variances = np.array([0.01, 0.0, 0.0, 0.0, 0.02]), np.array([1e-8] * 4 + [1e-2])
+    names = [f"exposure {k}" for k in range(5)]
+    columns = affine_columns(CROSS, None)
+    assert len(lamp_drift_module._alone(names, columns, flux, variances)) <= 2
+    line = affine_columns(np.array([(0, 0), (0, 5), (0, 7), (0, 11), (7, 0)], float), None)
+    found = lamp_drift_module._alone(names, line, flux, np.full(5, 1e-8))
+    assert all(np.isfinite(times) for _, times in found)
+    assert "exposure 4" not in dict(found)
 
 
 @pytest.mark.study

@@ -85,6 +85,20 @@ def test_one_array_that_is_flipped_is_named(bench, axes, words, variance):
     assert any(f"exposure 3 (from 0) fits better {words}" in each.message for each in found)
 
 
+@pytest.mark.long
+def test_a_flip_is_named_where_an_opposite_shift_would_not_fit_the_window():
+    rng, shape = np.random.default_rng(1), (200, 220)
+    shifts = np.array([(12 * k, (7 * k * k) % 40) for k in range(8)], float)
+    truth = simulate.paper_sensitivity(shape, rng=rng)
+    values = 6000 * simulate.exposures(truth, simulate.gaussian_beam(shape), shifts)
+    values += 7 * rng.standard_normal(values.shape)
+    values[6] = values[6, ::-1]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", errors.EquipixWarning)
+        found = equipix.calibrate(values, shifts, variance=np.full(8, 49.0)).findings
+    assert any("exposure 6 (from 0) fits better upside down" in each.message for each in found)
+
+
 @pytest.mark.parametrize("exposure", [2, 8])
 def test_one_shift_of_the_wrong_sign_is_named(exposure):
     """It was said to be turned by 180 degrees. With five positions too few are right to tell."""

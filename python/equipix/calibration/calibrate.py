@@ -14,7 +14,7 @@ from equipix.exposures.exposures import Exposures, FitOptions
 from equipix.exposures.flux import Flux
 from equipix.exposures.positions import Positions
 from equipix.findings import Finding, ask, say
-from equipix.fitting.error_bars import with_dark_misfit
+from equipix.fitting.error_bars import with_bounded_dark, with_dark_misfit
 from equipix.fitting.pixels import without_faint_pixels, without_false_pixels
 from equipix.fitting.stated_errors import steadied, widened
 from equipix.fitting.weighted import Options, is_to_be_fitted, weighted_fit
@@ -154,11 +154,11 @@ def calibrate(
         subtracted from frames of whole numbers; if the rounding of means is large beside their
         noise.
     IdentifiabilityWarning
-        If the shifts leave parts of the sensor unconnected or barely constrain a pattern; if less
-        than half of the pixels that are not masked are determined (`Calibration.is_partial`); if
-        free fluxes leave a tilt of the sensitivity undetermined; if a fitted dark is nearly
-        degenerate with the sensitivity; if shifts look like millimetres or micrometres; if the
-        order of the exposures lets a drift of the lamp look like a tilt.
+        If shifts or masks leave parts of the sensor unconnected; if the shifts barely constrain a
+        pattern; if less than half of the pixels that are not masked are determined
+        (`Calibration.is_partial`); if free fluxes leave a tilt of the sensitivity undetermined; if
+        a fitted dark is nearly degenerate with the sensitivity; if shifts look like millimetres or
+        micrometres; if the order of the exposures lets a drift of the lamp look like a tilt.
     ConvergenceWarning
         If the tolerance was not reached, or a fit is too far from its minimum for error bars.
     MisfitWarning
@@ -246,6 +246,7 @@ def calibrated(
     started = now()
     said += say(*ask(BEFORE, exposures))
     weighted = steadied(weighted_fit(exposures, options), exposures, options)
+    weighted = with_bounded_dark(weighted)
     # Until weights and priors are final.
     for step in (without_false_pixels, without_faint_pixels, widened, with_dark_misfit):
         weighted = step(weighted, options)

@@ -47,7 +47,7 @@ Pair = Annotated[Floats, "float64", "2"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Calibration(CorrectionBase, Record, kind="calibration", version=3):
+class Calibration(CorrectionBase, Record, kind="calibration", version=4):
     """Calibrated sensor, the result of `calibrate`; its arrays are read-only.
 
     Attributes
@@ -147,7 +147,8 @@ class Calibration(CorrectionBase, Record, kind="calibration", version=3):
         The same for each axis, with the best orientation and, in ``words``, what to do.
     drift : Drift or None
         What the data say of fluxes that were given: the size of the lamp's drift about them, its
-        standard error, the degrees of freedom, and the tilt that it hides, which is part of
+        standard error, the degrees of freedom, exposures of which one alone would explain it, and
+        the tilt that it hides, which is part of
         `sensitivity_std`, `tilt_std` and `std_of`. Errors of the tilt over `tilt_std` are at most
         as far out as Student's t with so many degrees of freedom. None where fluxes were fitted or
         have a prior, and where no combination of them leaves a residual.

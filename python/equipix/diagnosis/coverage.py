@@ -156,7 +156,7 @@ def why_apart(exposures: Exposures, fit: Fit) -> str:
     result = f"the shifts leave {fit.components} parts of the sensor unconnected"
     if cause := _uncompared(exposures):
         return f"{result}, since {cause}"
-    if _mask_separates(exposures, int(np.count_nonzero(fit.component_labels > 0))):
+    if _mask_separates(exposures, fit.component_labels > 0):
         return (
             f"{result}, since values between them are masked, missing or saturated: use shorter "
             "shifts, or less light where values saturate"
@@ -183,10 +183,9 @@ def _uncompared(exposures: Exposures) -> str | None:
     return None
 
 
-def _mask_separates(exposures: Exposures, left: int) -> bool:
-    """Whether the same shifts leave less than half as many pixels where every value is usable."""
+def _mask_separates(exposures: Exposures, apart: Bools) -> bool:
+    """Whether the shifts connect most of these pixels to the others where every value is usable."""
     rotation = exposures.positions.rotation.tolist()
     whole = whole_moves(exposures.positions.shifts)
-    _, counts, _ = _native.planned_components(exposures.shape, whole, rotation=rotation, mask=None)
-    rows, cols = exposures.shape
-    return 2 * (rows * cols - max(counts)) < left
+    labels, *_ = _native.planned_components(exposures.shape, whole, rotation=rotation, mask=None)
+    return _most(apart, labels == 0)

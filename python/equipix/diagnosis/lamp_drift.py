@@ -25,9 +25,13 @@ _WARNED = 1e-3
 _VISIBLE = 1e-6
 """Share of the variance of a trend below which what it leaves is rounding."""
 
-_ALONE = 2e-3
-"""Share of the squares of what fluxes leave up to which one flux explains them. One that is wrong
-by up to 20 % left 1e-3 at most."""
+_ALONE, _LIKELY = 2e-3, 0.05
+"""One flux explains what fluxes leave if it leaves less than this share of the squares, or if noise
+leaves more with this probability. The step is linear: one that was wrong by up to 30 % left 1.3e-3.
+"""
+
+_NAMED = 2
+"""Most exposures that are named: the two of an arm of a cross leave the same residual."""
 
 _LEAST = 1e-3
 """Share of the least variance of a flux below which an ε² is as good as 0."""
@@ -68,8 +72,8 @@ class Drift(ReadOnly):
         Size of the hidden tilt, edge to edge, if the lamp drifted linearly in the order of the
         exposures and left this residual; 0 where the trend was fitted or leaves none.
     alone : tuple of (str, float)
-        Exposures each of which alone explains them, with so many times the light that its flux
-        says; none where only one combination leaves a residual.
+        Exposures each of which, if its light was so many times what its flux says, makes the others
+        agree with theirs. None where more than two do, or with one degree of freedom.
     """
 
     size: float
@@ -109,7 +113,7 @@ class Drift(ReadOnly):
 
     @property
     def _words_of_one(self) -> str:
-        found = ", or ".join(f"{name} {times:.3g} times" for name, times in self.alone)
+        found = ", or ".join(f"{name} by {times - 1:+.2%}" for name, times in self.alone)
         return f", as if one exposure had other light than its flux says: {found}" if found else ""
 
     @property
@@ -189,7 +193,7 @@ def lamp_drift(weighted: Weighted, residuals: Residuals) -> Drift | None:
     if freedom < 1 or np.linalg.matrix_rank(columns) < columns.shape[1]:
         return None
     fluxes, variances = _free_fluxes(residuals, shifts, exposures.shape)
-    if not np.isfinite(variances).all():
+    if not np.isfinite([*variances, weighted.reduced_chi2]).all():
         return None
     weights = 1 / variances
     variances *= max(residuals.scale, weighted.reduced_chi2)
@@ -206,7 +210,7 @@ def lamp_drift(weighted: Weighted, residuals: Residuals) -> Drift | None:
         trend = np.abs(_slope_of_trend(columns, fluxes, total, weights)) * exposures.shape
     known = _combinations(columns, total)
     names = [exposures.name_of(k) for k in range(len(exposures))]
-    alone = _alone(names, columns, fluxes, variances) if freedom > 1 else ()
+    alone = _alone(names, columns, fluxes, variances) if known > 1 else ()
     return Drift(size, flux_std, known, probability, covariance, tilt, trend, alone)
 
 
@@ -222,14 +226,18 @@ def _alone(
 ) -> tuple[tuple[str, float], ...]:
     """Exposures each of whose flux explains what columns leave, and the factor on it."""
     roots = np.sqrt(variances)
-    values, all_left = fluxes / roots, _scatter(columns, fluxes, variances)
-    found = []
-    for k, name in enumerate(names):
-        own = left_by(columns / roots[:, None], np.eye(len(roots))[k] / roots)[0]
-        size = float(own @ values) / float(own @ own) if own.any() else 0.0
-        if all_left - size**2 * float(own @ own) < _ALONE * all_left:
-            found.append((name, float(np.exp(size))))
-    return tuple(found)
+    seen, _ = left_by(columns / roots[:, None], np.diag(1 / roots))
+    squares = np.sum(seen**2, axis=0)
+    known = squares > _VISIBLE / variances
+    sizes = np.divide(seen.T @ (fluxes / roots), squares, where=known, out=np.zeros(len(roots)))
+    of_all, freedom = _scatter(columns, fluxes, variances), len(roots) - columns.shape[1]
+    left = of_all - sizes**2 * squares
+    found = [
+        (name, float(np.exp(size)))
+        for name, size, each in zip(names, sizes, left, strict=True)
+        if each < _ALONE * of_all or chi2_tail(float(each), freedom - 1) > _LIKELY
+    ]
+    return tuple(found) if len(found) <= _NAMED else ()
 
 
 def _combinations(columns: Floats, variances: Floats) -> int:

@@ -191,9 +191,6 @@ _SHIFTS = frozenset({"sign", "unit"})
 _SOURCES = _SHIFTS | {"flux"}
 """Kinds beside which a cause of residuals is no news."""
 
-_EXPLAINED = _SOURCES | {"saturation", "colour"}
-"""Kinds that leave residuals of their own, which look like those of other causes."""
-
 _STRONGER = _SOURCES | {"orientation", "variance", "prior", "drift", "colour"}
 """Kinds whose causes leave what looks like a small error."""
 
@@ -215,9 +212,9 @@ AFTER: tuple[Rule[Evidence], ...] = (
     Rule("orientation", "identifiability", _hidden, unless=_SHIFTS | {"tilt"}),
     Rule("faint", "identifiability", _on_faint, severity="note"),
     Rule("colour", "misfit", _on_colours, unless=_SOURCES),
-    Rule("misfit", "misfit", _on_common_misfit, unless=_EXPLAINED),
-    Rule("drift", "misfit", _on_drift, unless=_EXPLAINED),
-    Rule("misfit", "misfit", _on_white_misfit, unless=_EXPLAINED),
+    Rule("misfit", "misfit", _on_common_misfit, unless=_SOURCES | {"colour"}),
+    Rule("drift", "misfit", _on_drift, unless=_SOURCES | {"colour"}),
+    Rule("misfit", "misfit", _on_white_misfit, unless=_SOURCES | {"colour", "saturation"}),
     Rule("prior", "misfit", _replaced("flux_std"), unless=_SOURCES),
     Rule("prior", "misfit", _replaced("shift_std"), unless=_SOURCES),
     Rule("convergence", "convergence", _on_convergence),

@@ -1,5 +1,6 @@
 """Standard deviations of what a fit found."""
 
+import dataclasses
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -104,6 +105,19 @@ def _of_dark(weighted: Weighted, answer: Uncertainty, scale: float) -> DarkStd:
     """Uncertainty of a fitted dark from the answers for unit weights."""
     along, alone = _std(scale, answer.offset_variances).tolist()
     return DarkStd(along if weighted.fit.ended == "converged" else None, alone)
+
+
+def with_bounded_dark(weighted: Weighted) -> Weighted:
+    """Bound the variance of the dark where no exposure shows its noise.
+
+    That of a frame without light is at most that of one with light. The scatter between neighbours
+    of one dark frame holds its pattern too.
+    """
+    exposures, most = weighted.exposures, weighted.reduced_chi2
+    if exposures.dark_variance is None or exposures.knows_noise or not np.isfinite(most):
+        return weighted
+    bounded = np.minimum(exposures.dark_variance, most)
+    return weighted._replace(exposures=dataclasses.replace(exposures, dark_variance=bounded))
 
 
 def with_dark_misfit(weighted: Weighted, options: Options) -> Weighted:

@@ -363,18 +363,21 @@ def _exchanged(window: Exposures, i: int, j: int) -> Exposures:
 
 
 def _reversed(exposures: Exposures, exposure: int) -> dict[str, Exposures]:
-    """Return the window with the shift of one exposure reversed along one axis, and along both."""
-    positions = exposures.positions
+    """Return the window with the shift of one exposure reversed along one axis, and along both.
+
+    Not where the positions would then be farther apart than the window is wide.
+    """
+    positions, sizes = exposures.positions, np.minimum(exposures.shape, _SIDE)
     row, col = positions.shifts[exposure].tolist()
     found = {}
     for shift in ((-row, col), (row, -col), (-row, -col)):
-        if shift == (row, col):
-            continue
         shifts = positions.shifts.copy()
         shifts[exposure] = shift
+        if shift == (row, col) or np.any(np.ptp(shifts, axis=0) >= sizes):
+            continue
         words = (
             f"{exposures.name_of(exposure)} fits better at the shift ({shift[0] + 0.0:g}, "
-            f"{shift[1] + 0.0:g}) than at ({row:g}, {col:g}): check its sign"
+            f"{shift[1] + 0.0:g}) than at ({row:g}, {col:g}): check its signs"
         )
         found[words] = exposures.at(dataclasses.replace(positions, shifts=shifts)).window(_SIDE)
     return found

@@ -29,7 +29,7 @@ from equipix.findings import Findings, usable
 from equipix.fitting.weighted import Options
 from equipix.measured.average import RunningAverage
 from equipix.measured.colour import Colours
-from equipix.measured.means import Averaged, variance_of_dark_alone
+from equipix.measured.means import Averaged
 from equipix.measured.measured import Measured, measured_of
 from equipix.measured.statistics import FrameStatistics, subtracted
 from equipix.plan.budget import between_pixels, error_budget
@@ -436,8 +436,6 @@ class Running:
             weights += weight
             information += np.multiply(weight, signal**2, where=seen, out=np.zeros(self._shape))
         of_dark = measured.dark_variance
-        if of_dark is None and self._dark is not None:
-            of_dark = np.broadcast_to(variance_of_dark_alone(self._dark), self._shape)
         known = np.isfinite(information) & (information > 0)
         if calibration is not None:
             known &= usable(calibration.flags)
