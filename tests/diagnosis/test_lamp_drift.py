@@ -87,16 +87,14 @@ def test_no_exposure_is_named_where_all_fluxes_drift():
     assert drift.alone == ()
 
 
-def test_one_combination_or_one_noisy_exposure_names_none():
-    """Then each of the others explains it."""
-    flux, variances = np.array([0.01, 0.0, 0.0, 0.0, 0.02]), np.array([1e-8] * 4 + [1e-2])
-    names = [f"exposure {k}" for k in range(5)]
-    columns = affine_columns(CROSS, None)
-    assert len(lamp_drift_module._alone(names, columns, flux, variances)) <= 2
-    line = affine_columns(np.array([(0, 0), (0, 5), (0, 7), (0, 11), (7, 0)], float), None)
-    found = lamp_drift_module._alone(names, line, flux, np.full(5, 1e-8))
-    assert all(np.isfinite(times) for _, times in found)
-    assert "exposure 4" not in dict(found)
+def test_a_position_off_the_line_of_all_others_is_never_named():
+    """Its flux leaves no residual but that of rounding."""
+    shifts = np.array([(0, 0), (0, 5), (0, 7), (0, 11), (7, 0)], float)
+    flux, names = np.array([0.01, 0.0, 0.0, 0.0, 0.02]), [f"exposure {k}" for k in range(5)]
+    columns = affine_columns(shifts, None)
+    found = lamp_drift_module._alone(names, columns, flux, np.full(5, 1e-8))
+    assert [name for name, _ in found] == ["exposure 0"]
+    assert found[0][1] == pytest.approx(np.exp(0.01))
 
 
 @pytest.mark.study
