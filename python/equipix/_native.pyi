@@ -122,6 +122,7 @@ class Exposures:
         flux_model: tuple[str, list[float]],
         offset: bool,
         variance: NDArray[Any] | None,
+        is_relative: bool,
         mask: NDArray[Any] | None,
         unreliable: NDArray[Any] | None,
         workers: int | None,

@@ -56,6 +56,21 @@ class TestCalibrate:
             pytest.approx(1, abs=1e-12)
         )
 
+    @pytest.mark.parametrize("noise", [0.3, 20.0])
+    def test_what_is_known_of_shifts_counts_beside_an_unknown_variance(self, noise):
+        """Variances of unit 1 over squared responses outweighed it: shifts ended 0.9 pixel off."""
+        rng, std = np.random.default_rng(6), 0.006
+        shifts = CROSS + std * rng.standard_normal((5, 2))
+        frames = exposures(sensor("RGGB")[0], noise=noise, shifts=shifts)
+        cal = equipix.calibrate(frames, CROSS, shift_std=std, cfa="RGGB")
+        assert cal.converged
+        known = equipix.calibrate(
+            frames, CROSS, shift_std=std, cfa="RGGB", variance=np.full(5, noise**2)
+        )
+        assert np.abs(cal.shifts - shifts).max() < 5 * std
+        # Weights differ by the responses of the colours, so each has noise of its own.
+        assert np.abs(cal.shifts - known.shifts).max() < 2 * std
+
     def test_metadata_keep_labels_of_several_letters(self):
         truth, _ = sensor("RGGB")
         cfa = [["red", "green"], ["green", "blue"]]

@@ -45,7 +45,7 @@ fn check_history(experiment: &Experiment, answer: &Answer) {
     let pixels = (experiment.shape[0] * experiment.shape[1]) as f64;
     let weights: f64 = match &experiment.noise {
         Noise::Unknown => experiment.frames.len() as f64,
-        Noise::Exposures(variances) => variances.iter().map(|v| pixels / v).sum(),
+        Noise::Exposures(v) | Noise::Relative(v) => v.iter().map(|v| pixels / v).sum(),
         Noise::Measurements(variances) => variances.iter().map(|v| 1.0 / v).sum(),
     };
     let brightest = experiment.frames.iter().fold(0.0_f64, |top, y| top.max(y.abs()));
@@ -103,8 +103,24 @@ fn fluxes_with_a_prior() {
         let experiment = simulation.experiment();
         check(&experiment.clone().with_lamp(Lamp::Prior(std.clone())));
         let unknown = Experiment { noise: Noise::Unknown, ..experiment };
-        check(&unknown.with_lamp(Lamp::Prior(std.clone())));
+        check(&unknown.clone().with_lamp(Lamp::Prior(std.clone())));
+        let relative = Noise::Relative(vec![3e4, 2e4, 1e4, 2e4, 3e4]);
+        check(&Experiment { noise: relative, ..unknown }.with_lamp(Lamp::Prior(std.clone())));
     }
+}
+
+#[test]
+fn equal_variances_in_an_unknown_unit_are_unknown_ones() {
+    let simulation = noisy(LONG, &BETWEEN).with_noise(1e-4, 3);
+    let simulation = Simulation { beam: rolling, ..simulation };
+    let experiment = simulation.experiment().measured_to(&SHIFT_STD);
+    let with = |noise| fit(&Experiment { noise, ..experiment.clone() }, Options::to(1e-8)).unwrap();
+    let (unknown, relative) = (with(Noise::Unknown), with(Noise::Relative(vec![1.0; 5])));
+    assert!(unknown.refined && relative.converged);
+    assert_eq!(unknown.sensitivity, relative.sensitivity);
+    assert_eq!(unknown.shifts, relative.shifts);
+    // Known, they say 1e8 times less than what is known of the shifts.
+    assert_ne!(with(Noise::Exposures(vec![1.0; 5])).shifts, relative.shifts);
 }
 
 #[test]

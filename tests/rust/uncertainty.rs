@@ -35,7 +35,7 @@ impl Case {
         let answer = fit(&experiment, Options::to(TOLERANCE)).unwrap();
         assert!(answer.converged && answer.few.is_empty());
         let unit = match experiment.noise {
-            Noise::Unknown => answer.misfit / answer.degrees_of_freedom as f64,
+            Noise::Unknown | Noise::Relative(_) => answer.misfit / answer.degrees_of_freedom as f64,
             _ => 1.0,
         };
         let used = experiment.clone().without(&answer.lost);

@@ -284,6 +284,7 @@ class Exposures(Measured):
                 flux_model=self.flux.model,
                 offset=self.offset,
                 variance=self.variance,
+                is_relative=self.relative,
                 mask=self.mask,
                 unreliable=self.bad_pixels.unreliable,
                 workers=options.workers,

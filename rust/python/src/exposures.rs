@@ -26,7 +26,7 @@ impl PyExposures {
     /// Checks the exposures of an experiment.
     #[new]
     #[pyo3(signature = (frames, shifts, *, shift_std, rotation, flux, flux_model, offset, variance,
-                        mask, unreliable, workers, progress))]
+                        is_relative, mask, unreliable, workers, progress))]
     #[expect(clippy::too_many_arguments, reason = "all that is known of exposures")]
     fn new(
         py: Python<'_>,
@@ -38,6 +38,7 @@ impl PyExposures {
         flux_model: (String, Vec<f64>),
         offset: bool,
         variance: Option<Py<PyAny>>,
+        is_relative: bool,
         mask: Option<Py<PyAny>>,
         unreliable: Option<PyReadonlyArray2<'_, bool>>,
         workers: Option<NonZeroUsize>,
@@ -56,6 +57,9 @@ impl PyExposures {
                 let mut exposures = Exposures::new(m, positions, flux, offset, &workers, control)?;
                 if let Some(unreliable) = unreliable {
                     exposures = exposures.with_unreliable(unreliable)?;
+                }
+                if is_relative {
+                    exposures = exposures.with_relative_variance();
                 }
                 Ok(exposures.checked().clone())
             })

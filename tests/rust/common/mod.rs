@@ -35,6 +35,8 @@ pub(crate) enum Noise {
     Unknown,
     Exposures(Vec<f64>),
     Measurements(Vec<f64>),
+    /// Of exposures, in an unknown unit.
+    Relative(Vec<f64>),
 }
 
 /// The exposures of one sensor, and what is to be found from them.
@@ -220,7 +222,7 @@ pub(crate) fn misfit_by_dark(
 /// The variance of a measurement of weight 1: 1 where variances are given, else reduced χ².
 fn variance_of_weight_1(experiment: &Experiment, answer: &Answer) -> f64 {
     match experiment.noise {
-        Noise::Unknown => answer.misfit / answer.degrees_of_freedom as f64,
+        Noise::Unknown | Noise::Relative(_) => answer.misfit / answer.degrees_of_freedom as f64,
         _ => 1.0,
     }
 }
@@ -249,7 +251,7 @@ fn with_exposures<R>(
     let shape = Shape::new(rows, cols);
     let variance = match noise {
         Noise::Unknown => Variance::Unknown,
-        Noise::Exposures(variance) => Variance::Exposures(variance),
+        Noise::Exposures(variance) | Noise::Relative(variance) => Variance::Exposures(variance),
         Noise::Measurements(variance) => {
             Variance::Measurements(Stack::new("variance", variance, count, shape)?)
         }
@@ -263,14 +265,18 @@ fn with_exposures<R>(
         Lamp::Prior(std) => FluxKind::Prior(std.clone()),
     };
     let (rotations, std) = (rotations(experiment)?, experiment.shift_std.clone());
-    visit(&Exposures::new(
+    let exposures = Exposures::new(
         Measurements { frames, variance, mask },
         Positions { shifts: shifts.clone(), rotations, std },
         Flux { values: experiment.flux.clone(), kind },
         experiment.offset,
         workers,
         &Control::new(),
-    )?)
+    )?;
+    visit(&match noise {
+        Noise::Relative(_) => exposures.with_relative_variance(),
+        _ => exposures,
+    })
 }
 
 /// Asks something of an answer.

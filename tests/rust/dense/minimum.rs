@@ -39,7 +39,7 @@ impl Minimum {
         dense.prior.clone_from(&answer.prior);
         let mut unit_is_off = 0.0;
         let third = answer.history.get(SETTLING - 1).or(answer.history.last())?;
-        if let Noise::Unknown = experiment.noise {
+        if let Noise::Unknown | Noise::Relative(_) = experiment.noise {
             // Without the degree of freedom that the gauge is.
             dense.unit = answer.misfit / (answer.degrees_of_freedom - 1) as f64;
             unit_is_off = (third.objective / answer.history.last()?.objective - 1.0).abs();

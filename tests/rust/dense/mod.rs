@@ -203,7 +203,7 @@ fn measurements(experiment: &Experiment) -> Vec<Measurement> {
         let (exposure, pixel) = (index / pixels, index % pixels);
         let weight = match &experiment.noise {
             Noise::Unknown => 1.0,
-            Noise::Exposures(variance) => 1.0 / variance[exposure],
+            Noise::Exposures(variance) | Noise::Relative(variance) => 1.0 / variance[exposure],
             Noise::Measurements(variance) => 1.0 / variance[index],
         };
         Measurement { exposure, pixel, value, weight }

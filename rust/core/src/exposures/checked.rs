@@ -35,6 +35,7 @@ pub struct Checked {
     geometry: Geometry,
     tallies: Vec<Tally>,
     unreliable: Vec<usize>,
+    is_relative: bool,
 }
 
 impl Checked {
@@ -73,8 +74,16 @@ impl<'a, T: Real> Exposures<'a, T> {
         let tallies = tallies.collect::<Result<Vec<_>>>()?;
         check_light(&tallies)?;
         let unreliable = Vec::new();
-        let checked = Checked { positions, flux, offset, geometry, tallies, unreliable };
+        let checked =
+            Checked { positions, flux, offset, geometry, tallies, unreliable, is_relative: false };
         Ok(Self { measurements, checked })
+    }
+
+    /// The same exposures, with variances in an unknown unit: only their ratios are known.
+    #[must_use]
+    pub const fn with_relative_variance(mut self) -> Self {
+        self.checked.is_relative = true;
+        self
     }
 
     /// The same exposures, with pixels whose measurements contradict each other: M is fitted there, flagged,
@@ -212,10 +221,10 @@ impl<'a, T: Real> Exposures<'a, T> {
         Ok(is_measured.into_iter().filter(|is_measured| *is_measured).count())
     }
 
-    /// Whether the variance of the values is known.
+    /// Whether the variance of the values is known, and not only its ratios.
     #[must_use]
     pub const fn variance_is_known(&self) -> bool {
-        !matches!(self.measurements.variance, Variance::Unknown)
+        !matches!(self.measurements.variance, Variance::Unknown) && !self.checked.is_relative
     }
 
     /// The light of the brightest measurement: the largest y/c.
