@@ -54,3 +54,16 @@ def test_calibrate_asks():
     with pytest.warns(errors.IdentifiabilityWarning, match=r"micrometres: .* multiples of 8\.3"):
         cal = equipix.calibrate(frames, shifts, tolerance=1e-2)
     assert "unit" in {finding.kind for finding in cal.findings}
+
+
+@pytest.mark.long
+def test_calibrate_does_not_ask_where_the_data_confirm_the_shifts():
+    shape, shifts = (60, 80), 1.5 * np.array([(0, 0), (0, 7), (0, 11), (7, 0), (11, 0), (5, 6)])
+    truth = simulate.paper_sensitivity(shape, rng=1)
+    beam = simulate.wavy_beam(shape, contrast=0.2, rng=1)
+    frames = simulate.exposures(truth, beam, shifts)
+    frames += 1e-3 * np.random.default_rng(1).standard_normal(frames.shape)
+    assert micrometre_step(shifts, shape) == 1.5
+    cal = equipix.calibrate(frames, shifts, variance=np.full(6, 1e-6))
+    assert cal.shift_sign == "confirmed"
+    assert cal.findings == ()

@@ -170,8 +170,11 @@ def _uncompared(exposures: Exposures) -> str | None:
     Measured positions of one line scatter about it.
     """
     shifts, turned = exposures.positions.shifts, exposures.positions.are_turned
-    if not np.ptp(shifts, axis=0).any() and not turned:
+    most = float(np.ptp(shifts, axis=0).max())
+    if not turned and most == 0:
         return "they are all alike: move the sensor between exposures"
+    if not turned and most < _OFF_LINE:
+        return f"they differ by {most:.2g} pixel at most: move the sensor farther"
     if len(exposures) < _FEWEST:
         return (
             f"{len(exposures)} exposures compare pixels along one direction only: take "

@@ -6,7 +6,7 @@ import numpy as np
 
 from equipix._check import Array, Bools
 from equipix.exposures.exposures import Exposures
-from equipix.exposures.positions import Positions, micrometre_step, nearest_whole
+from equipix.exposures.positions import Positions, nearest_whole
 from equipix.findings import Rule
 from equipix.fitting.residuals import on_sensor
 from equipix.measured.saturation import clipping_advice
@@ -30,23 +30,15 @@ def _on_raw(exposures: Exposures) -> str | None:
     )
 
 
-def _on_units(exposures: Exposures) -> str | None:
-    """Say that shifts look like millimetres, or like micrometres."""
-    shifts = exposures.positions.shifts
-    most = float(np.ptp(shifts, axis=0).max())
-    if 0 < most < _LEAST_MOVE:
-        return (
-            f"the shifts differ by {most:.2g} pixel at most (limit {_LEAST_MOVE:g}), from which "
-            "next to nothing follows. Expected are pixels: divide millimetres by the pixel pitch, "
-            "see 'From micrometres to pixels' in docs/shifts.md"
-        )
-    step = micrometre_step(shifts, exposures.shape)
-    if step is None:
+def _on_millimetres(exposures: Exposures) -> str | None:
+    """Say that shifts look like millimetres."""
+    most = float(np.ptp(exposures.positions.shifts, axis=0).max())
+    if not 0 < most < _LEAST_MOVE:
         return None
     return (
-        f"the shifts look like micrometres: they are multiples of {step:g}, and the largest is "
-        f"{abs(shifts - shifts[0]).max():g}. Expected are pixels: divide micrometres by the pixel "
-        "pitch, see 'From micrometres to pixels' in docs/shifts.md"
+        f"the shifts differ by {most:.2g} pixel at most (limit {_LEAST_MOVE:g}), from which "
+        "next to nothing follows. Expected are pixels: divide millimetres by the pixel pitch, "
+        "see 'From micrometres to pixels' in docs/shifts.md"
     )
 
 
@@ -216,7 +208,7 @@ BEFORE: tuple[Rule[Exposures], ...] = (
     Rule("saturation", "input", lambda e: clipping_advice(e.clipped) if e.clipped else None),
     Rule("raw", "input", _on_raw),
     Rule("light", "misfit", lambda e: e.unsteady),
-    Rule("unit", "identifiability", _on_units),
+    Rule("unit", "identifiability", _on_millimetres),
     Rule("flux", "misfit", on_brightness),
     Rule("repeated", "misfit", _on_repeats),
     Rule("cfa", "misfit", lambda e: e.filters.words if e.filters else None),

@@ -7,6 +7,7 @@ import numpy as np
 from equipix.diagnosis.coverage import is_limited, left_out, too_far, too_few, why_apart, why_far
 from equipix.diagnosis.evidence import Evidence
 from equipix.diagnosis.small_errors import small_errors_found
+from equipix.exposures.positions import micrometre_step
 from equipix.findings import Rule
 from equipix.fitting.error_bars import fits_noise, incomplete_searches, why_none
 
@@ -19,6 +20,19 @@ _FEW = 0.01
 
 _WHITE = frozenset({"noise", "signal"})
 """Causes of a misfit that neighbouring residuals do not have in common."""
+
+
+def _on_micrometres(e: Evidence) -> str | None:
+    """Say that shifts look like micrometres, unless the data confirm them as they are."""
+    shifts = e.exposures.positions.shifts
+    step = micrometre_step(shifts, e.exposures.shape)
+    if step is None or (e.orientation.sign == "confirmed" and e.misfit is None):
+        return None
+    return (
+        f"the shifts look like micrometres: they are multiples of {step:g}, and the largest is "
+        f"{abs(shifts - shifts[0]).max():g}. Expected are pixels: divide micrometres by the pixel "
+        "pitch, see 'From micrometres to pixels' in docs/shifts.md"
+    )
 
 
 def _on_sign(e: Evidence) -> str | None:
@@ -195,6 +209,7 @@ _STRONGER = _SOURCES | {"orientation", "variance", "prior", "drift", "colour"}
 """Kinds whose causes leave what looks like a small error."""
 
 AFTER: tuple[Rule[Evidence], ...] = (
+    Rule("unit", "identifiability", _on_micrometres),
     Rule("partial", "identifiability", too_far, severity="failure"),
     Rule("sign", "misfit", _on_sign),
     Rule("orientation", "identifiability", _on_orientation, unless=_SHIFTS),
