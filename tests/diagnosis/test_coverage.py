@@ -107,6 +107,13 @@ def test_the_cause_is_named(shifts, options, cause):
     assert [each.kind for each in found.findings].count("components") == 0
 
 
+def test_millimetres_lie_on_no_line():
+    flux, positions = Flux.of(None, None, None, 5), Positions.of(0.0083 * CROSS)
+    given = Exposures.of(measured_of(exposures(CROSS)), positions, flux)
+    words = "they differ by 0.058 pixel at most: move the sensor farther"
+    assert coverage._uncompared(given) == words
+
+
 @pytest.mark.parametrize(
     ("shifts", "cause", "components"),
     [
