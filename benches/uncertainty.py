@@ -34,6 +34,7 @@ def rows(shape: tuple[int, int] = (582, 782), repetitions: int = 3) -> list[Row]
         both = time.perf_counter() - start - solve
         cal.std_of(weights)
         functional = time.perf_counter() - start - solve - both
+        assert cal.weighted is not None  # kept, since it was not loaded
         cal.weighted.exposures.fit(FitOptions())
         alone = time.perf_counter() - start - solve - both - functional
         seconds.append((solve, both - solve, functional, alone))
