@@ -124,11 +124,13 @@ def with_dark_misfit(weighted: Weighted, options: Options) -> Weighted:
     """Add what the noise of the dark adds to F, unless the fit is too far from its minimum."""
     exposures, fit = weighted.exposures, weighted.fit
     found = fit.ended == "converged" or float(fit.error_estimate[-1]) <= _FOUND
-    if exposures.dark_variance is None or not found:
+    unit = weighted.noise_variance
+    if exposures.dark_variance is None or not (found and unit > 0):
         return weighted
     with naming_memory("the misfit of the dark"):
-        variance = np.ascontiguousarray(exposures.dark_variance)
-        added = fit.dark_misfit(variance, workers=options.fit.workers)
+        # In its unit, in which the core decides what is negligible.
+        variance = np.ascontiguousarray(exposures.dark_variance / unit)
+        added = unit * fit.dark_misfit(variance, workers=options.fit.workers)
     return weighted._replace(dark_misfit=added)
 
 
