@@ -62,6 +62,17 @@ def test_the_pattern_of_one_dark_frame_counts_as_noise_of_a_frame_at_most(patter
     assert np.sqrt((1 / 5 + 1 / 4) / (1 / 5 + 1)) < _single_frames(1, pattern).std() < 1
 
 
+def test_a_variance_that_is_given_for_the_dark_of_arrays_stays():
+    """They may be means of many frames less a dark of one."""
+    rng = np.random.default_rng(1)
+    cross = equipix.cross_pattern(5, 7)
+    frames = simulate.exposures(np.ones(SHAPE), simulate.gaussian_beam(SHAPE), cross)
+    frames += 1e-3 * rng.standard_normal(frames.shape)
+    cal = equipix.calibrate(frames, cross, dark_variance=1e-5)
+    assert cal.reduced_chi2 < 1e-5
+    assert np.all(cal.weighted.exposures.dark_variance == 1e-5)
+
+
 def _single_frames(dark_frames, pattern):
     """Errors of M over their standard deviations, of one frame at each position."""
     rng = np.random.default_rng(1)

@@ -111,10 +111,13 @@ def with_bounded_dark(weighted: Weighted) -> Weighted:
     """Bound the variance of the dark where no exposure shows its noise.
 
     That of a frame without light is at most that of one with light. The scatter between neighbours
-    of one dark frame holds its pattern too.
+    of one dark frame holds its pattern too. Arrays, of which no dark is kept, may be means of many
+    frames: the variance that is given for their dark stays.
     """
     exposures, most = weighted.exposures, weighted.reduced_chi2
-    if exposures.dark_variance is None or exposures.knows_noise or not np.isfinite(most):
+    if exposures.dark is None or exposures.dark_variance is None:
+        return weighted
+    if exposures.knows_noise or not np.isfinite(most):
         return weighted
     bounded = np.minimum(exposures.dark_variance, most)
     return weighted._replace(exposures=dataclasses.replace(exposures, dark_variance=bounded))
